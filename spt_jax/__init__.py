@@ -1,0 +1,1 @@
+"""A self-intersection penalty for triangle meshes and body models in JAX."""

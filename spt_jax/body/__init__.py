@@ -1,0 +1,1 @@
+"""The body model: blend shapes, a kinematic tree and linear blend skinning in JAX."""

@@ -1,0 +1,1 @@
+"""Fitting: objectives and solvers that use the penalty."""

@@ -1,0 +1,36 @@
+"""Strictness for the whole suite: types are checked, promotions are explicit, both precisions run."""
+
+import jax
+import numpy as np
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+with install_import_hook("spt_jax", "beartype.beartype"):
+    import spt_jax  # noqa: F401
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """Run a test once in each precision; the test builds its arrays with the value given."""
+    before = jax.config.read("jax_enable_x64")
+    jax.config.update("jax_enable_x64", request.param == "float64")
+    yield np.dtype(request.param)
+    jax.config.update("jax_enable_x64", before)
+
+
+@pytest.fixture
+def x64():
+    """Run a test in double precision."""
+    before = jax.config.read("jax_enable_x64")
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", before)
+
+
+@pytest.fixture
+def rng():
+    """One seeded generator a test."""
+    return np.random.default_rng(0)
