@@ -1,0 +1,165 @@
+"""What every public function asks of its mesh and its rays, checked while tracing."""
+
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from spt_jax.rays.beam import Rays, orthogonal_directions
+from spt_jax.rays.measure import Directions
+
+# More rays than this along a side ask for more crossings than a machine can hold.
+_MOST_RAYS = 16384
+
+
+def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Int[Array, "F 3"]]:
+    """The mesh as JAX arrays.
+
+    Raises:
+        TypeError: vertices not floating point, faces not whole numbers.
+        ValueError: a shape that is not (..., V, 3) or (F, 3); an index out of range, where the
+            faces' values are known (inside `jit` with traced faces they are not, and such a mesh
+            gives NaN).
+    """
+    given = getattr(vertices, "dtype", None)
+    if given is None:
+        vertices = np.asarray(vertices)
+        given = vertices.dtype
+    if given not in (np.float32, np.float64):
+        raise TypeError(
+            f"vertices must be float32 or float64: got {given}; convert them with "
+            "vertices.astype(jnp.float32)."
+        )
+    shape = np.shape(vertices)
+    if len(shape) < 2 or shape[-1] != 3:
+        raise ValueError(
+            f"vertices must have shape (..., V, 3): got {shape}; the last axis is x, y, z."
+        )
+    given = getattr(faces, "dtype", None)
+    if given is None:
+        faces = np.asarray(faces)
+        given = faces.dtype
+    if not np.issubdtype(given, np.integer):
+        raise TypeError(f"faces must be whole numbers: got {given}; use int32 indices.")
+    face_shape = np.shape(faces)
+    if len(face_shape) != 2 or face_shape[-1] != 3:
+        raise ValueError(
+            f"faces must have shape (F, 3): got {face_shape}; split other polygons into "
+            "triangles, and batch meshes of different faces with jax.vmap."
+        )
+    if not isinstance(faces, jax.core.Tracer):
+        check_indices(np.asarray(faces), shape[-2])
+    if np.issubdtype(given, np.unsignedinteger) or np.dtype(given).itemsize > 4:
+        faces = faces.astype(np.int32)
+    return jnp.asarray(vertices), jnp.asarray(faces)
+
+
+def check_indices(faces: np.ndarray, num_vertices: int) -> None:
+    """Raise ValueError unless every index names a vertex."""
+    for wrong in (faces.min(initial=0), faces.max(initial=-1)):
+        if wrong < 0 or wrong >= num_vertices:
+            if wrong < 0 and faces.size == 0:
+                continue
+            raise ValueError(
+                f"faces must index into vertices: got index {wrong} for {num_vertices} vertices; "
+                "indices are 0-based."
+            )
+
+
+def as_rays(rays: Any) -> Rays:
+    """A whole number of rays along the longer side, or (rows, columns).
+
+    Raises:
+        TypeError, ValueError: anything else, or a number out of 1 to 16384.
+    """
+    if isinstance(rays, str) and rays == "auto":
+        raise ValueError(
+            'rays="auto" is not in this version: got "auto"; pass a whole number, such as '
+            "rays=512 (the default), or (rows, columns)."
+        )
+    pair = isinstance(rays, (tuple, list)) and len(rays) == 2
+    sides = rays if pair else (rays,)
+    if not all(isinstance(side, (int, np.integer)) and not isinstance(side, bool) for side in sides):
+        raise TypeError(
+            f"rays must be a whole number or (rows, columns): got {rays!r}; 512 is a good start."
+        )
+    if any(side < 1 or side > _MOST_RAYS for side in sides):
+        raise ValueError(
+            f"rays must be from 1 to {_MOST_RAYS} a side: got {rays!r}; 512 is a good start."
+        )
+    return (int(sides[0]), int(sides[1])) if pair else int(sides[0])
+
+
+def as_directions(directions: Any) -> Directions:
+    """One or three orthogonal directions, or the rows of a D x 3 array, as unit vectors.
+
+    Raises:
+        TypeError: traced directions, or something that is no array of numbers.
+        ValueError: another count than 1 or 3; another shape than (D, 3) with D > 0; a direction
+            that is zero or not finite.
+    """
+    if isinstance(directions, jax.core.Tracer):
+        raise TypeError(
+            "directions must be known when traced: got a traced array; pass 1, 3 or a NumPy array."
+        )
+    if isinstance(directions, (int, np.integer)) and not isinstance(directions, bool):
+        if directions not in (1, 3):
+            raise ValueError(
+                f"directions must be 1, 3 or an array of shape (D, 3): got {directions}; pass the "
+                "directions themselves for another count."
+            )
+        return orthogonal_directions(int(directions))
+    try:
+        rows = np.asarray(directions, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"directions must be 1, 3 or an array of shape (D, 3): got {directions!r}."
+        ) from None
+    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0:
+        raise ValueError(
+            f"directions must be 1, 3 or an array of shape (D, 3): got shape {rows.shape}; give "
+            "one direction as [[x, y, z]]."
+        )
+    for k, row in enumerate(rows):
+        if not np.isfinite(row).all() or not np.abs(row).max() > 0:
+            raise ValueError(
+                f"directions must be finite and not zero: got {row.tolist()} in row {k}; lengths "
+                "do not matter, they are normalised."
+            )
+    # Scaling by the largest component first keeps tiny and huge vectors from under- or overflowing.
+    rows = rows / np.abs(rows).max(axis=1, keepdims=True)
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return tuple((float(x), float(y), float(z)) for x, y, z in rows)
+
+
+def as_choice(name: str, value: Any, choices: Any) -> Any:
+    """The value itself, one of the Literal type's own.
+
+    Raises:
+        ValueError: any other value.
+    """
+    allowed = get_args(choices)
+    if value not in allowed:
+        listed = ", ".join(repr(choice) for choice in allowed)
+        raise ValueError(f"{name} must be one of {listed}: got {value!r}.")
+    return value
+
+
+Backend = Literal["auto", "numpy", "xla"]
+
+
+def as_backend(backend: Any) -> Backend:
+    """The backend's name.
+
+    Raises:
+        ValueError: an unknown name, or one that this version lacks.
+    """
+    as_choice("backend", backend, Backend)
+    if backend == "xla":
+        raise ValueError(
+            'backend="xla" is not in this version: got "xla"; use "auto" or "numpy", which also '
+            "work on a GPU, at the price of a transfer to the host."
+        )
+    return backend

@@ -1,0 +1,150 @@
+"""The way from XLA to NumPy and back: the only `pure_callback` of the package.
+
+Three traps shape this file:
+
+- On CPU a callback gets its operands as `jax.Array`s, and one above about 100 kB is copied on the
+  thread pool that is waiting for the callback: the program hangs
+  (https://github.com/jax-ml/jax/issues/24255, https://github.com/jax-ml/jax/issues/25861).
+  So arrays travel as pieces of at most 96 kB and are joined here, and a batching rule of our own
+  cuts them again where `vmap` would have made every piece larger.
+- Raising inside a callback is undefined behaviour: what can be wrong in the values comes back as
+  NaN, everything else is refused while tracing.
+- The callback has no derivative. `stop_gradient` on its operands keeps outer transformations
+  (Hessian-vector products, implicit differentiation) from asking for one.
+"""
+
+import functools
+import os
+from collections.abc import Callable, Hashable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from spt_jax.rays.measure import Map
+
+_PIECE_BYTES = 96 * 1024
+
+# function(vertices, faces, options, map) -> one array per result; NumPy alone, never raises.
+HostFunction = Callable[[np.ndarray, np.ndarray, Any, Map], tuple[np.ndarray, ...]]
+# Shape of a result for one mesh, and its dtype's name.
+ResultSpec = tuple[tuple[int, ...], str]
+
+
+def call_on_host(
+    function: HostFunction,
+    options: Hashable,
+    results: tuple[ResultSpec, ...],
+    vertices: Float[Array, "*batch V 3"],
+    faces: Int[Array, "F 3"],
+) -> tuple[Array, ...]:
+    """Run a NumPy function once per mesh of the batch, on as many threads as the process may use.
+
+    Args:
+        function: a module-level function; its identity is part of the cache key, so a lambda made
+            anew for each call would be traced anew for each call.
+        options: handed on as they are.
+        results: for each result, its shape for one mesh and its dtype.
+        vertices: any number of leading batch axes.
+        faces: shared by the batch; under `vmap` they may be batched too.
+
+    Differentiation: none; all derivatives through the result are zero.
+    """
+    batch = vertices.shape[:-2]
+    bridge = _bridge(function, options, results)
+    flat = jax.lax.stop_gradient(vertices).reshape(-1, *vertices.shape[-2:])
+    found = bridge(flat, jax.lax.stop_gradient(faces)[None])
+    return tuple(x.reshape(batch + x.shape[1:]) for x in found)
+
+
+@functools.cache
+def _bridge(function: HostFunction, options: Hashable, results: tuple[ResultSpec, ...]):
+    @jax.custom_batching.custom_vmap
+    def bridge(vertices, faces):
+        num_meshes = vertices.shape[0]
+        host = _host_entry(function, options, results, vertices.shape, faces.shape)
+        shapes = tuple(
+            jax.ShapeDtypeStruct((num_meshes, *shape), dtype) for shape, dtype in results
+        )
+        return jax.pure_callback(host, shapes, _pieces(vertices), _pieces(faces))
+
+    @bridge.def_vmap
+    def batched(axis_size, in_batched, vertices, faces):
+        vertices_batched, faces_batched = in_batched
+        if not vertices_batched:
+            vertices = jnp.broadcast_to(vertices[None], (axis_size, *vertices.shape))
+        num_meshes = vertices.shape[1]
+        if faces_batched or faces.shape[0] > 1:
+            if not faces_batched:
+                faces = faces[None]
+            faces = jnp.broadcast_to(faces, (axis_size, num_meshes, *faces.shape[-2:]))
+            faces = faces.reshape(-1, *faces.shape[-2:])
+        found = bridge(vertices.reshape(-1, *vertices.shape[2:]), faces)
+        found = tuple(x.reshape(axis_size, num_meshes, *x.shape[1:]) for x in found)
+        return found, tuple(True for _ in found)
+
+    return bridge
+
+
+def _pieces(array: Array) -> tuple[Array, ...]:
+    flat = array.reshape(-1)
+    step = _PIECE_BYTES // flat.dtype.itemsize
+    return tuple(flat[start : start + step] for start in range(0, flat.size, step))
+
+
+@functools.cache
+def _host_entry(function, options, results, vertices_shape, faces_shape):
+    """The callback itself, the same object for the same work so that XLA's caches are hit."""
+
+    def run_on_host(vertex_pieces, face_pieces):
+        vertices = _join(vertex_pieces, vertices_shape, np.float64)
+        faces = _join(face_pieces, faces_shape, np.int64)
+        meshes = list(zip(vertices, np.broadcast_to(faces, (len(vertices), *faces_shape[1:]))))
+        if len(meshes) == 1:
+            found = [function(*meshes[0], options, parallel_map)]
+        else:
+            found = parallel_map(lambda mesh: function(*mesh, options, map), meshes)
+        return tuple(
+            np.stack([one[k] for one in found]).astype(dtype).reshape(len(meshes), *shape)
+            if meshes
+            else np.zeros((0, *shape), dtype)
+            for k, (shape, dtype) in enumerate(results)
+        )
+
+    return run_on_host
+
+
+def _join(pieces, shape: tuple[int, ...], dtype) -> np.ndarray:
+    # jax.Array -> NumPy by np.asarray alone: any other use of jax here may wait for the thread
+    # that waits for us.
+    arrays = [np.asarray(piece) for piece in pieces]
+    joined = np.concatenate(arrays) if arrays else np.zeros(0)
+    return joined.astype(dtype).reshape(shape)
+
+
+def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
+    """Like map, on the process's own threads; NumPy releases the lock in sorts and large loops."""
+    items = list(items)
+    if len(items) < 2 or _usable_cores() < 2:
+        return [function(item) for item in items]
+    return list(_executor().map(function, items))
+
+
+def _usable_cores() -> int:
+    # The affinity, not the machine: containers and job schedulers hand out fewer cores.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@functools.cache
+def _executor() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_usable_cores(), thread_name_prefix="spt_jax")
+
+
+if hasattr(os, "register_at_fork"):
+    # A forked child inherits the executor but not its threads.
+    os.register_at_fork(after_in_child=_executor.cache_clear)

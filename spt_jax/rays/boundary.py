@@ -1,0 +1,78 @@
+"""The gradient of the overlap volume, as one vector per vertex (DESIGN of the method below).
+
+Moving the surface with velocity v changes the overlap volume by the integral of c (v . n) over
+the surface, c = sign(w_out) being the class of Algorithm 1. With linear triangles the gradient at
+vertex t is the sum over its triangles of n times the integral of c lambda_t; where c is constant
+around t that is the paper's Eq. 9. Rays are a quadrature of the integral: a crossing stands for
+the surface area a / |n . d| of its triangle.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from spt_jax.rays.beam import Beam
+from spt_jax.rays.levels import Overlaps
+
+
+def area_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
+    """Outward normals of the triangles, each as long as twice the triangle's area."""
+    corner = vertices[faces]
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+
+
+def boundary_gradient(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    beam: Beam,
+    overlaps: Overlaps,
+    directions: Float[np.ndarray, "D 3"],
+) -> Float[np.ndarray, "V 3"]:
+    """One beam's share of the boundary integral; the beams' shares add up to the gradient.
+
+    Each crossing is weighed by (n . d)^2 / sum over all directions d' of (n . d')^2. With a
+    single direction the weight is one and the result is the exact derivative of the beam's
+    volume; with several, a grazing crossing, whose area is unbounded and badly sampled, weighs
+    next to nothing and the directions that see its triangle well take over.
+    """
+    corners = faces[overlaps.face]
+    normal = area_normals(vertices, corners)
+    cosines = normal @ directions.T
+    seen = np.einsum("kd,kd->k", cosines, cosines)
+    # area * (n.d)^2 / sum (n.d')^2 * n, with lengths of normals cancelling: no root, no division
+    # by a cosine that may vanish.
+    weight = overlaps.class_sign * np.abs(normal @ beam.direction) * beam.ray_area
+    weight = weight / np.where(seen > 0, seen, 1.0)
+    force = weight[:, None] * normal
+    vertex = corners.ravel()
+    gradient = np.empty(vertices.shape)
+    for axis in range(3):
+        share = (overlaps.barycentric * force[:, axis, None]).ravel()
+        gradient[:, axis] = np.bincount(vertex, share, len(vertices))
+    return gradient
+
+
+def vertex_gradient(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    label: Int[np.ndarray, "V"],
+    *,
+    unit: bool,
+) -> Float[np.ndarray, "V 3"]:
+    """The paper's gradient: Eq. 9, or Eq. 10 where `unit` (zero where the normals cancel)."""
+    gradient = np.zeros(vertices.shape)
+    if not label.any():
+        return gradient
+    touching = np.flatnonzero((label != 0)[faces].any(axis=1))
+    corners = faces[touching]
+    normal = area_normals(vertices, corners)
+    for axis in range(3):
+        share = np.broadcast_to(normal[:, axis, None], corners.shape).ravel()
+        gradient[:, axis] = np.bincount(corners.ravel(), share, len(vertices))
+    if unit:
+        norm = np.linalg.norm(gradient, axis=1, keepdims=True)
+        gradient /= np.where(norm > 0, norm, 1.0)
+    else:
+        gradient /= 6.0  # a third of each triangle's area, and the normals are twice the area
+    return gradient * label[:, None]
