@@ -1,0 +1,305 @@
+"""The body model: shape and pose in, vertices and joints out."""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, DTypeLike, Float, Int
+
+from . import poses
+from .rotations import matrix_from_axis_angle
+from .skinning import (
+    blend_shapes,
+    displacement,
+    forward_kinematics,
+    lift,
+    linear_blend_skinning,
+)
+
+
+class PosedBody(NamedTuple):
+    """A body in a pose: `vertices` (..., V, 3) and `joints` (..., J, 3), in metres."""
+
+    vertices: Float[Array, "*batch V 3"]
+    joints: Float[Array, "*batch J 3"]
+
+
+class BodyModel(eqx.Module):
+    """A statistical body of the SMPL family: blend shapes, a tree of joints, linear blend skinning.
+
+    With shape b, joint rotations R_j relative to the parents and the tree's world motions G_j
+    (Loper et al. 2015, equations 2 to 10):
+
+        rest(b, R) = template + shape_basis b + pose_basis vec(R_1 - I, ..., R_J-1 - I)
+        J(b) = joint_template + joint_shape_basis b
+        vertices = sum over j of weights_j G_j(R, J(b)) rest(b, R)
+
+    Get one from `load_body`. It is a pytree: pass it through `jit`, `vmap` or `grad` like an array.
+
+    Attributes:
+        template: rest vertices of the mean shape, in metres.
+        shape_basis: displacement of each vertex for one unit of each shape coefficient, in metres.
+        joint_template: joints of the mean shape at rest, in metres.
+        joint_shape_basis: displacement of each joint for one unit of each coefficient, in metres.
+        weights: skinning weights; rows sum to 1.
+        faces: vertex indices of each triangle, counter-clockwise seen from outside.
+        parents: the parent of each joint; -1 for joint 0, the root.
+        joint_names: one name for each joint.
+        pose_basis: pose blend shapes, the coefficients row by row through R_1 - I to R_J-1 - I; or
+            None.
+
+    Raises:
+        TypeError: an array has the wrong kind of dtype.
+        ValueError: shapes disagree, `parents` is not a tree in order, or `faces` has an index
+            outside the vertices.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax.body import load_body
+        >>> body = load_body()
+        >>> posed = body(jnp.zeros((body.num_joints, 3)))
+        >>> posed.vertices.shape, posed.joints.shape
+        ((12272, 3), (52, 3))
+    """
+
+    template: Float[Array, "V 3"]
+    shape_basis: Float[Array, "V 3 B"]
+    joint_template: Float[Array, "J 3"]
+    joint_shape_basis: Float[Array, "J 3 B"]
+    weights: Float[Array, "V J"]
+    faces: Int[Array, "F 3"]
+    parents: tuple[int, ...] = eqx.field(static=True)
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+    pose_basis: Float[Array, "V 3 P"] | None = None
+
+    def __check_init__(self):
+        vertices, joints = self.template.shape[0], self.joint_template.shape[0]
+        coefficients = self.shape_basis.shape[-1] if self.shape_basis.ndim else 0
+        expected = {
+            "template": (vertices, 3),
+            "shape_basis": (vertices, 3, coefficients),
+            "joint_template": (joints, 3),
+            "joint_shape_basis": (joints, 3, coefficients),
+            "weights": (vertices, joints),
+            "pose_basis": (vertices, 3, 9 * (joints - 1)),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if array is None:
+                continue
+            if array.shape != shape:
+                raise ValueError(
+                    f"{name} must have shape {shape} for {vertices} vertices, {joints} joints and "
+                    f"{coefficients} shape coefficients: got {tuple(array.shape)}."
+                )
+            if not jnp.issubdtype(array.dtype, jnp.floating):
+                raise TypeError(f"{name} must be floating-point: got dtype {array.dtype}.")
+        if self.faces.ndim != 2 or self.faces.shape[1] != 3:
+            raise ValueError(
+                f"faces must be triangles, shape (F, 3): got {tuple(self.faces.shape)}; "
+                "split polygons first."
+            )
+        if self.faces.dtype != np.int32:
+            raise TypeError(f"faces must be int32: got {self.faces.dtype}; cast them.")
+        if len(self.parents) != joints or len(self.joint_names) != joints:
+            raise ValueError(
+                f"parents and joint_names must have one entry for each of {joints} joints: got "
+                f"{len(self.parents)} and {len(self.joint_names)}."
+            )
+        for joint, parent in enumerate(self.parents):
+            if (parent != -1) if joint == 0 else not 0 <= parent < joint:
+                raise ValueError(
+                    "parents must be -1 for joint 0 and an earlier joint for every other: got "
+                    f"{parent} for joint {joint} ({self.joint_names[joint]}); reorder the joints."
+                )
+        if not isinstance(self.faces, Tracer) and self.faces.size:
+            low, high = int(np.min(self.faces)), int(np.max(self.faces))
+            if low < 0 or high >= vertices:
+                raise ValueError(
+                    f"faces must index into vertices: got indices {low} to {high} for {vertices} "
+                    "vertices; indices are 0-based."
+                )
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of vertices."""
+        return self.template.shape[0]
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints, the root included."""
+        return self.joint_template.shape[0]
+
+    @property
+    def num_shape(self) -> int:
+        """Number of shape coefficients."""
+        return self.shape_basis.shape[-1]
+
+    def __call__(
+        self,
+        pose: Float[Array | np.ndarray, "*#batch J 3"],
+        shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
+        translation: Float[Array | np.ndarray, "*#batch 3"] | None = None,
+    ) -> PosedBody:
+        """The body's vertices and joints in a pose.
+
+        The class says the equations. Everything is computed in the dtype of `pose`.
+
+        Args:
+            pose: axis-angle of each joint relative to its parent, in radians; row 0 is the global
+                orientation, about the pelvis. `pose_from_smpl` makes one from an SMPL pose.
+            shape: coefficients of the first components of the shape basis; fewer than the body
+                has leave the rest at zero, and None means the mean shape.
+            translation: added to vertices and joints, in metres; None means zero.
+
+        Any number of leading batch axes, which broadcast against each other.
+
+        Returns:
+            PosedBody(vertices, joints).
+
+        Raises:
+            TypeError: an argument is not floating-point.
+            ValueError: a shape does not fit the body, or batch axes do not broadcast.
+
+        Differentiation: every mode and order, with respect to the arguments and to the model's
+            arrays; finite at the zero pose and at an angle of pi.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from spt_jax.body import load_body
+            >>> body = load_body()
+            >>> two_shapes = jnp.array([[1.0], [-1.0]])
+            >>> body(jnp.zeros((52, 3)), two_shapes).vertices.shape
+            (2, 12272, 3)
+        """
+        angles = _floating("pose", pose)
+        if angles.ndim < 2 or angles.shape[-2:] != (self.num_joints, 3):
+            raise ValueError(
+                f"pose must be (..., {self.num_joints}, 3), one axis-angle row a joint: got shape "
+                f"{tuple(angles.shape)}; for SMPL's layouts use body.pose_from_smpl(pose)."
+            )
+        dtype = angles.dtype
+        betas = None if shape is None else self._coefficients(shape, dtype)
+        shift = None if translation is None else _floating("translation", translation).astype(dtype)
+        if shift is not None and (shift.ndim < 1 or shift.shape[-1] != 3):
+            raise ValueError(f"translation must be (..., 3): got shape {tuple(shift.shape)}.")
+        batch = _broadcast_batches(
+            pose=angles.shape[:-2],
+            shape=() if betas is None else betas.shape[:-1],
+            translation=() if shift is None else shift.shape[:-1],
+        )
+
+        return _pose(self, angles, betas, shift, batch_rank=len(batch))
+
+    def rest(
+        self, shape: Float[Array | np.ndarray, "*batch B"] | None = None
+    ) -> Float[Array, "*batch V 3"]:
+        """The vertices of the zero pose, in metres.
+
+        Args:
+            shape: coefficients of the first components of the shape basis; None means the mean.
+
+        Returns:
+            template + shape_basis b, in the dtype of `shape`, or of the model where it is None.
+
+        Raises:
+            TypeError: `shape` is not floating-point.
+            ValueError: `shape` has more coefficients than the body.
+
+        Differentiation: every mode; the map is affine.
+
+        Example:
+            >>> from spt_jax.body import load_body
+            >>> float(load_body().rest().max(axis=0)[1] - load_body().rest().min(axis=0)[1]) > 1.6
+            True
+        """
+        if shape is None:
+            return self.template
+        betas = self._coefficients(shape, None)
+        return blend_shapes(self.template, self.shape_basis, betas, betas.dtype)
+
+    def pose_from_smpl(self, pose: Float[Array | np.ndarray, "..."]) -> Float[Array, "*batch J 3"]:
+        """This body's pose from a pose of 22, 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints.
+
+        Rotations are copied by joint name. Joints that the pose lacks stay at rest; joints that
+        this body lacks are dropped: on the embedded body SMPL-X's jaw and eyes and SMPL's two
+        lumped hand joints.
+
+        Args:
+            pose: axis-angle, in radians, as (..., joints, 3) or flat as (..., 3 * joints).
+
+        Returns:
+            A pose for this body, in the dtype of `pose`.
+
+        Raises:
+            TypeError: `pose` is not floating-point.
+            ValueError: `pose` has none of those shapes.
+
+        Differentiation: every mode; the map is linear.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from spt_jax.body import load_body
+            >>> body = load_body()
+            >>> body.pose_from_smpl(jnp.zeros((8, 72))).shape
+            (8, 52, 3)
+        """
+        return poses.pose_from_smpl(pose, self.joint_names)
+
+    def _coefficients(self, shape, dtype: DTypeLike | None) -> Float[Array, "*batch B"]:
+        betas = _floating("shape", shape)
+        if betas.ndim < 1 or betas.shape[-1] > self.num_shape:
+            raise ValueError(
+                f"shape must have at most {self.num_shape} coefficients in its last axis: got "
+                f"shape {tuple(betas.shape)}; drop the last ones, or load the body with a larger "
+                "num_shape where its file has them."
+            )
+        return betas if dtype is None else betas.astype(dtype)
+
+
+# Compiled here as well as by the caller: outside jit that is one compilation, not one for each of
+# 200 small operations (a first call of 0.8 s, not 4 s).
+@partial(jax.jit, static_argnames="batch_rank")
+def _pose(body: BodyModel, angles, betas, shift, batch_rank: int) -> PosedBody:
+    dtype = angles.dtype
+    # Equal ranks from the start: jax_numpy_rank_promotion="raise" is respected.
+    rotations = lift(matrix_from_axis_angle(angles), batch_rank, 3)
+    vertices = lift(blend_shapes(body.template, body.shape_basis, betas, dtype), batch_rank, 2)
+    joints = blend_shapes(body.joint_template, body.joint_shape_basis, betas, dtype)
+    joints = lift(joints, batch_rank, 2)
+    if body.pose_basis is not None:
+        eye = jnp.eye(3, dtype=dtype).reshape((1,) * (batch_rank + 1) + (3, 3))
+        bend = rotations[..., 1:, :, :] - eye
+        bend = bend.reshape(*bend.shape[:-3], 9 * (body.num_joints - 1))
+        vertices = vertices + displacement(body.pose_basis, bend)
+    world, positions = forward_kinematics(rotations, joints, body.parents)
+    weights = body.weights.astype(dtype)
+    vertices = linear_blend_skinning(vertices, weights, world, positions, joints)
+    if shift is not None:
+        shift = lift(shift, batch_rank, 1)[..., None, :]
+        vertices, positions = vertices + shift, positions + shift
+    return PosedBody(vertices, positions)
+
+
+def _floating(name: str, value) -> Float[Array, "..."]:
+    array = jnp.asarray(value)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        raise TypeError(
+            f"{name} must be floating-point: got dtype {array.dtype}; "
+            f"convert it with {name}.astype('float32')."
+        )
+    return array
+
+
+def _broadcast_batches(**batches: tuple[int, ...]) -> tuple[int, ...]:
+    try:
+        return jnp.broadcast_shapes(*batches.values())
+    except ValueError as error:
+        seen = ", ".join(f"{name} {batch}" for name, batch in batches.items())
+        raise ValueError(
+            f"batch axes must broadcast against each other: got {seen}; make them equal or 1."
+        ) from error

@@ -1,0 +1,169 @@
+"""A slow, obvious body model in NumPy, and a writer of small synthetic SMPL files."""
+
+import pickle
+import struct
+import sys
+import types
+from typing import ClassVar
+
+import numpy as np
+import scipy.sparse
+
+from spt_jax.body.poses import SMPL_LAYOUTS
+
+# Columns of kintree_table, root first, for SMPL, SMPL-H and SMPL-X.
+_BODY_PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
+
+
+def _finger_parents(left, right, first):
+    parents = []
+    for wrist in (left, right):
+        for _ in range(5):
+            parents += [wrist, first + len(parents), first + len(parents) + 1]
+    return parents
+
+
+PARENTS = {
+    24: [*_BODY_PARENTS, 20, 21],
+    52: [*_BODY_PARENTS, *_finger_parents(20, 21, 22)],
+    55: [*_BODY_PARENTS, 15, 15, 15, *_finger_parents(20, 21, 25)],
+}
+
+
+def slow_rotation(axis_angle):
+    """Rodrigues' formula for one vector."""
+    angle = np.linalg.norm(axis_angle)
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = axis_angle / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def slow_body(smpl, pose, shape, translation, keep=slice(None)):
+    """SMPL's published formulas with loops over joints and vertices, in float64.
+
+    `smpl` holds v_template, shapedirs, posedirs (or None), weights, J_regressor (or J and
+    J_shapedirs) and parents.
+    """
+    shapedirs = np.asarray(smpl["shapedirs"], np.float64)[..., : len(shape)]
+    v_shaped = smpl["v_template"] + shapedirs @ shape
+    if "J_regressor" in smpl:
+        joints = smpl["J_regressor"] @ v_shaped
+    else:
+        joints = smpl["J"] + np.asarray(smpl["J_shapedirs"], np.float64) @ shape
+    rotations = [slow_rotation(row) for row in np.asarray(pose, np.float64)]
+    v_posed = v_shaped
+    if smpl.get("posedirs") is not None:
+        feature = np.concatenate([(r - np.eye(3)).ravel() for r in rotations[1:]])
+        v_posed = v_shaped + smpl["posedirs"] @ feature
+
+    world = []
+    for joint, parent in enumerate(smpl["parents"]):
+        local = np.eye(4)
+        local[:3, :3] = rotations[joint]
+        local[:3, 3] = joints[joint] - (joints[parent] if joint else 0)
+        world.append(world[parent] @ local if joint else local)
+    posed = []
+    for vertex, weights in zip(v_posed[keep], smpl["weights"][keep], strict=True):
+        total = np.zeros(3)
+        for joint, weight in enumerate(weights):
+            total += weight * (
+                world[joint][:3, :3] @ (vertex - joints[joint]) + world[joint][:3, 3]
+            )
+        posed.append(total + translation)
+    return np.array(posed), np.array([w[:3, 3] for w in world]) + translation
+
+
+def synthetic_smpl(rng, joints=24, vertices=60, components=10):
+    """Arrays with the keys, shapes and dtypes of a file of the SMPL family, and random numbers."""
+    parents = PARENTS[joints]
+    weights = rng.random((vertices, joints)) * (rng.random((vertices, joints)) < 0.2)
+    weights[:, 0] += 0.1
+    regressor = rng.random((joints, vertices)) * (rng.random((joints, vertices)) < 0.2)
+    regressor[:, 0] += 0.1
+    table = np.array([parents, range(joints)], np.int64).astype(np.uint32)  # -1: 4294967295
+    return {
+        "v_template": rng.normal(size=(vertices, 3)),
+        "shapedirs": 0.1 * rng.normal(size=(vertices, 3, components)),
+        "posedirs": 0.05 * rng.normal(size=(vertices, 3, 9 * (joints - 1))),
+        "J_regressor": regressor / regressor.sum(axis=1, keepdims=True),
+        "weights": weights / weights.sum(axis=1, keepdims=True),
+        "kintree_table": table,
+        "f": rng.integers(0, vertices, (2 * vertices, 3)).astype(np.uint32),
+    }
+
+
+def with_parents(smpl):
+    """The arrays of a synthetic file as `slow_body` wants them."""
+    return smpl | {"parents": PARENTS[smpl["kintree_table"].shape[1]]}
+
+
+def _chumpy_class(module, name):
+    return type(name, (), {"__module__": module})
+
+
+Ch = _chumpy_class("chumpy.ch", "Ch")
+Select = _chumpy_class("chumpy.reordering", "Select")
+
+
+def chumpy_array(array):
+    """What chumpy pickles for a leaf array."""
+    value = Ch()
+    value.__dict__.update(x=array, _dirty_vars=set(), _itr=None)
+    return value
+
+
+def chumpy_select(array, indices, shape):
+    """What chumpy pickles for a slice of another array."""
+    value = Select()
+    value.__dict__.update(a=chumpy_array(array), idxs=indices, preferred_shape=shape)
+    return value
+
+
+class Python2Pickler(pickle._Pickler):
+    """Writes strings and bytes as Python 2 did: one kind of string, without an encoding."""
+
+    dispatch: ClassVar = dict(pickle._Pickler.dispatch)
+
+    def save_string(self, value):
+        raw = value.encode("latin1") if isinstance(value, str) else value
+        self.write(pickle.BINSTRING + struct.pack("<i", len(raw)) + raw)
+        self.memoize(value)
+
+    dispatch[bytes] = save_string
+    dispatch[str] = save_string
+
+
+def write_official_pkl(path, smpl, monkeypatch):
+    """The arrays as SMPL's official files hold them: Python 2, chumpy and a sparse regressor."""
+    for name in ("chumpy", "chumpy.ch", "chumpy.reordering"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    sys.modules["chumpy.ch"].Ch = Ch
+    sys.modules["chumpy.reordering"].Select = Select
+    shapedirs = smpl["shapedirs"]
+    values = smpl | {
+        "v_template": chumpy_array(smpl["v_template"]),
+        "shapedirs": chumpy_select(shapedirs, np.arange(shapedirs.size), shapedirs.shape),
+        "weights": chumpy_array(smpl["weights"]),
+        "J_regressor": scipy.sparse.csc_matrix(smpl["J_regressor"]),
+        "bs_type": "lrotmin",
+        "bs_style": "lbs",
+    }
+    with open(path, "wb") as file:
+        Python2Pickler(file, protocol=2).dump(values)
+    content = path.read_bytes()
+    for new, old in (
+        (b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"),
+        (b"cscipy.sparse._csc\n", b"cscipy.sparse.csc\n"),
+    ):
+        assert new in content
+        content = content.replace(new, old)
+    path.write_bytes(content)
+    for name in ("chumpy", "chumpy.ch", "chumpy.reordering"):
+        monkeypatch.delitem(sys.modules, name)
+
+
+def smpl_pose(rng, joints, *batch):
+    """Random axis-angle rows of up to about half a turn, and the joints' names."""
+    return rng.normal(scale=0.7, size=(*batch, joints, 3)), SMPL_LAYOUTS[joints]
