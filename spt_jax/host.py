@@ -13,8 +13,11 @@ Three traps shape this file:
   (Hessian-vector products, implicit differentiation) from asking for one.
 """
 
+import atexit
 import functools
 import os
+import threading
+import time
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -130,7 +133,12 @@ def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
     items = list(items)
     if len(items) < 2 or _usable_cores() < 2:
         return [function(item) for item in items]
-    return list(_executor().map(function, items))
+    try:
+        futures = [_executor().submit(function, item) for item in items]
+    except RuntimeError:
+        # The interpreter is shutting down and takes no new work from pools.
+        return [function(item) for item in items]
+    return [future.result() for future in futures]
 
 
 def _usable_cores() -> int:
@@ -148,3 +156,21 @@ def _executor() -> ThreadPoolExecutor:
 if hasattr(os, "register_at_fork"):
     # A forked child inherits the executor but not its threads.
     os.register_at_fork(after_in_child=_executor.cache_clear)
+
+
+_LONGEST_WAIT_AT_EXIT = 5.0  # seconds
+
+
+@atexit.register
+def _finish_pending_work() -> None:
+    """Let results that nobody waited for arrive before the interpreter goes.
+
+    A callback that asks for Python's lock while the interpreter finalises aborts the process. A
+    script whose last line computes a penalty and reads nothing is enough.
+    """
+    deadline = time.monotonic() + _LONGEST_WAIT_AT_EXIT
+    pause = threading.Event()
+    while time.monotonic() < deadline:
+        if all(array.is_deleted() or array.is_ready() for array in jax.live_arrays("cpu")):
+            return
+        pause.wait(0.005)
