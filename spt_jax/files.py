@@ -1,0 +1,104 @@
+"""Output files that are whole or absent, in folders that are checked first."""
+
+import json
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+
+def ensure_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder at a path, made with its parents where missing, once it can be written.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        OSError: it cannot be made or written; the subclass is the system's own.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # os.access answers for the real user id and not for a full or read-only disk; a file does.
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise _folder_error(folder, error) from error
+    return folder
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path beside `path` that takes its place when the block ends well.
+
+    Whatever ends the block early, KeyboardInterrupt included, removes the temporary file and leaves
+    a file already at `path` as it was.
+
+    Args:
+        path: where the file is to stand; its folder must exist.
+
+    Raises:
+        OSError: the folder is missing or cannot be written, or `path` is itself a folder.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with atomic_write(folder / "note.txt") as temporary:
+        ...     _ = temporary.write_text("done")
+        >>> (folder / "note.txt").read_text()
+        'done'
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise IsADirectoryError(f"path must name a file: got the folder {str(target)!r}")
+    # The suffix stays last: trimesh and NumPy choose or extend the format by it.
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
+    try:
+        temporary.touch(exist_ok=False)
+    except OSError as error:
+        raise _folder_error(target.parent, error) from error
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write a value as indented JSON, atomically; arrays become lists and paths strings.
+
+    Raises:
+        TypeError: something in it has no JSON form.
+        ValueError: it holds NaN or infinity, which JSON cannot say.
+        OSError: as in `atomic_write`.
+    """
+
+    def plain(item: Any) -> Any:
+        if isinstance(item, np.ndarray | np.generic | Array):
+            return np.asarray(item).tolist()
+        if isinstance(item, os.PathLike):
+            return os.fspath(item)
+        raise TypeError(
+            f"value must hold JSON types, arrays and paths: got {type(item).__name__}; convert it"
+        )
+
+    try:
+        text = json.dumps(value, indent=2, default=plain, allow_nan=False)
+    except ValueError as error:
+        raise ValueError(f"value must be finite to be written as JSON: got {error}") from error
+    with atomic_write(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _folder_error(folder: Path, error: OSError) -> OSError:
+    return type(error)(
+        f"out must be a folder that can be written: got {str(folder)!r} ({error.strerror}); "
+        "make the folder or choose another"
+    )

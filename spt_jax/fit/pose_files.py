@@ -1,0 +1,232 @@
+"""Pose files: the .npz layouts of AMASS, SMPL, SMPL-H and SMPL-X, and this project's own."""
+
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from spt_jax.files import atomic_write
+
+JOINT_COUNTS = (22, 24, 52, 55)
+"""Body alone; SMPL; SMPL-H, with fingers; SMPL-X, with jaw and eyes before the fingers."""
+
+_HANDS = ("left_hand_pose", "right_hand_pose")
+_HEAD = ("jaw_pose", "leye_pose", "reye_pose")
+_POSES = ("poses", "pose")
+_SHAPES = ("betas", "shape")
+_TRANSLATIONS = ("trans", "transl", "translation")
+_KEYS = {*_POSES, *_SHAPES, *_TRANSLATIONS, *_HANDS, *_HEAD, "global_orient", "body_pose", "name"}
+_ACCEPTED = (
+    "poses or pose (N frames of 22, 24, 52 or 55 axis-angle rows), or global_orient with body_pose"
+)
+
+
+class PoseFile(NamedTuple):
+    """What a pose file holds; it unpacks as (pose, shape, translation, names)."""
+
+    pose: Float[np.ndarray, "N J 3"]
+    """Axis-angle in radians, each joint relative to its parent; row 0 is the global orientation."""
+    shape: Float[np.ndarray, "*frames B"] | None
+    """Shape coefficients: one set (B,) for all frames, or one a frame (N, B)."""
+    translation: Float[np.ndarray, "N 3"] | None
+    names: list[str]
+
+
+def read_poses(path: str | os.PathLike[str]) -> PoseFile:
+    """Return the poses of an .npz file, with shape, translation and names where it has them.
+
+    Layouts, told apart by their keys:
+    - AMASS and this project: `poses` or `pose`, with frames of 66, 72, 156 or 165 numbers or of
+      22, 24, 52 or 55 rows of 3; one frame may come without its leading axis.
+    - SMPL, SMPL-H and SMPL-X parameters: `global_orient` and `body_pose` (21 joints, or SMPL's 23);
+      with `left_hand_pose` or `right_hand_pose` the result has 52 joints, with `jaw_pose`,
+      `leye_pose` or `reye_pose` 55; those of the group that are missing are zero.
+
+    Beside either: `betas` or `shape`; `trans`, `transl` or `translation`; `name`, one a frame.
+    Nothing is unpickled.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not an .npz file, pickled arrays, missing keys, wrong sizes, or NaN or infinity;
+            the message names the file, the key, the shape seen and what is accepted.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise FileNotFoundError(f"pose file must exist: got {str(path)!r}; check the spelling")
+    if not zipfile.is_zipfile(file):  # np.load would take it for a pickle, and say only that
+        raise ValueError(f"pose file must be an .npz archive: got {str(path)!r}")
+    with np.load(file, allow_pickle=False) as archive:
+        # Other keys are left alone: some AMASS releases pickle the gender.
+        arrays = {key: _load(archive, key, file) for key in archive.files if key in _KEYS}
+        keys = sorted(archive.files)
+    key = next((key for key in _POSES if key in arrays), None)
+    if key is not None:
+        pose = _frames(file, arrays, key, JOINT_COUNTS)
+    elif "global_orient" in arrays and "body_pose" in arrays:
+        pose = _from_parts(file, arrays)
+    else:
+        raise ValueError(f"pose file must hold {_ACCEPTED}: got {str(path)!r} with keys {keys}")
+    return PoseFile(
+        pose,
+        _shape(file, arrays, len(pose)),
+        _translation(file, arrays, len(pose)),
+        _names(file, arrays, len(pose)),
+    )
+
+
+def write_poses(
+    path: str | os.PathLike[str],
+    pose: Float[Array | np.ndarray, "..."],
+    *,
+    shape: Float[Array | np.ndarray, "..."] | None = None,
+    translation: Float[Array | np.ndarray, "..."] | None = None,
+    names: Sequence[str] | None = None,
+) -> None:
+    """Write poses as an .npz file in AMASS' layout, atomically; `read_poses` returns them as given.
+
+    The keys are `poses` (N, 3 J), and where given `betas`, `trans` (N, 3) and `name` (N,).
+
+    Args:
+        path: the file; its suffix must be .npz.
+        pose: axis-angle (N, J, 3) or (J, 3), in radians, of 22, 24, 52 or 55 joints.
+        shape: (B,) or (N, B).
+        translation: (N, 3) or (3,).
+        names: one for each frame.
+
+    Raises:
+        ValueError: another suffix, or what `read_poses` would not accept.
+        OSError: the folder is missing or cannot be written.
+    """
+    file = Path(path)
+    if file.suffix.lower() != ".npz":
+        raise ValueError(f"path must end in .npz: got {str(path)!r}")
+    given = {"poses": pose, "betas": shape, "trans": translation}
+    arrays = {key: np.asarray(value) for key, value in given.items() if value is not None}
+    frames = _frames(file, arrays, "poses", JOINT_COUNTS)
+    if names is not None:
+        arrays["name"] = np.asarray(names, dtype=np.str_)
+        _names(file, arrays, len(frames))
+    _shape(file, arrays, len(frames))
+    _translation(file, arrays, len(frames))
+    arrays["poses"] = arrays["poses"].reshape(len(frames), -1)
+    with atomic_write(file) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+
+def _load(archive: Mapping[str, np.ndarray], key: str, file: Path) -> np.ndarray:
+    try:
+        return archive[key]
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(
+            f"pose file must hold plain arrays: got {str(file)!r} with {key!r} ({error}); "
+            "save it again without objects"
+        ) from error
+
+
+def _finite(file: Path, arrays: Mapping[str, np.ndarray], key: str) -> np.ndarray:
+    values = arrays[key]
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{key} must hold numbers: got {values.dtype} in {str(file)!r}")
+    if not np.isfinite(values).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
+        raise ValueError(f"{key} must be finite: got {values[place]} at {place} in {str(file)!r}")
+    return values.astype(np.float64)
+
+
+def _frames(
+    file: Path, arrays: Mapping[str, np.ndarray], key: str, counts: Sequence[int]
+) -> Float[np.ndarray, "N J 3"]:
+    values = _finite(file, arrays, key)
+    shape = values.shape
+    if values.ndim == 3 and shape[1] in counts and shape[2] == 3:
+        frames = values
+    elif values.ndim == 2 and shape[0] in counts and shape[1] == 3:
+        frames = values[None]
+    elif values.ndim in (1, 2) and shape[-1] in [3 * count for count in counts]:
+        frames = values.reshape(-1, shape[-1] // 3, 3)
+    else:
+        rows = " or ".join(map(str, counts))
+        raise ValueError(
+            f"{key} must hold frames of {rows} axis-angle rows, (N, J, 3) or (N, 3 J): got shape "
+            f"{shape} in {str(file)!r}; convert rotation matrices and hand components first"
+        )
+    if len(frames) == 0:
+        raise ValueError(f"{key} must hold at least one frame: got none in {str(file)!r}")
+    return frames
+
+
+def _from_parts(file: Path, arrays: Mapping[str, np.ndarray]) -> Float[np.ndarray, "N J 3"]:
+    body = _frames(file, arrays, "body_pose", (21, 23))
+    root = _frames(file, arrays, "global_orient", (1,))
+    parts = [root, body]
+    hands, head = (any(key in arrays for key in group) for group in (_HANDS, _HEAD))
+    if (hands or head) and body.shape[1] != 21:
+        raise ValueError(
+            f"body_pose must hold 21 rows beside separate hands or face: got {body.shape[1]} in "
+            f"{str(file)!r}; SMPL's last two rows are its hands"
+        )
+    wanted = [(key, 1) for key in _HEAD if head] + [(key, 15) for key in _HANDS if hands or head]
+    for key, count in wanted:
+        parts.append(
+            _frames(file, arrays, key, (count,))
+            if key in arrays
+            else np.zeros((len(body), count, 3))
+        )
+    lengths = [len(part) for part in parts]
+    frames = max(lengths)
+    if any(length not in (1, frames) for length in lengths):
+        keys = ["global_orient", "body_pose", *(key for key, _ in wanted)]
+        raise ValueError(
+            f"{', '.join(keys)} must have one number of frames: got {lengths} in {str(file)!r}"
+        )
+    return np.concatenate([np.broadcast_to(p, (frames, *p.shape[1:])) for p in parts], axis=1)
+
+
+def _shape(
+    file: Path, arrays: Mapping[str, np.ndarray], frames: int
+) -> Float[np.ndarray, "*frames B"] | None:
+    key = next((key for key in _SHAPES if key in arrays), None)
+    if key is None:
+        return None
+    values = _finite(file, arrays, key)
+    if values.ndim == 2 and len(values) == 1 and frames != 1:
+        values = values[0]
+    if values.ndim not in (1, 2) or (values.ndim == 2 and len(values) != frames):
+        raise ValueError(
+            f"{key} must have shape (B,) or ({frames}, B): got {values.shape} in {str(file)!r}"
+        )
+    return values
+
+
+def _translation(
+    file: Path, arrays: Mapping[str, np.ndarray], frames: int
+) -> Float[np.ndarray, "N 3"] | None:
+    key = next((key for key in _TRANSLATIONS if key in arrays), None)
+    if key is None:
+        return None
+    values = _finite(file, arrays, key)
+    if values.shape not in ((3,), (1, 3), (frames, 3)):
+        raise ValueError(
+            f"{key} must have shape (3,) or ({frames}, 3): got {values.shape} in {str(file)!r}"
+        )
+    return np.broadcast_to(values, (frames, 3)).copy()
+
+
+def _names(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> list[str]:
+    if "name" not in arrays:
+        return [file.stem] if frames == 1 else [f"{file.stem}/{i:04d}" for i in range(frames)]
+    names = np.atleast_1d(arrays["name"])
+    if names.dtype.kind != "U" or names.shape != (frames,):
+        raise ValueError(
+            f"name must hold {frames} strings: got {names.dtype} {names.shape} in {str(file)!r}"
+        )
+    return [str(name) for name in names]
