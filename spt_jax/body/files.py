@@ -108,7 +108,8 @@ def _embedded_body(num_shape: int | None, dtype: np.dtype) -> BodyModel:
 
 def _read_npz(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # Opened here, because NumPy leaves the file open where the archive is damaged.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
             if not isinstance(data, np.lib.npyio.NpzFile):
                 raise ValueError("it holds one array, not an archive of named arrays")
             return {
