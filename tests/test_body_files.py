@@ -41,7 +41,7 @@ def _assert_moves_as(body, smpl, rng):
     np.testing.assert_allclose(posed.joints, joints, atol=1e-10)
 
 
-@pytest.mark.parametrize("joints", [24, 52, 55])
+@pytest.mark.parametrize("joints", [52, 55])
 def test_npz_moves_as_the_slow_reference(tmp_path, rng, x64, joints):
     smpl = synthetic_smpl(rng, joints)
     np.savez(tmp_path / "model.npz", **smpl, extra=np.array({"not": "read"}, dtype=object))
@@ -228,6 +228,12 @@ def test_contents_that_contradict_themselves_are_named(tmp_path, rng):
     table[0, 5] = 99
     np.savez(path, **(smpl | {"kintree_table": table}))
     with pytest.raises(ValueError, match="got 99 for joint 5"):
+        load_body(path)
+    np.savez(path, **(smpl | {"weights": 2 * smpl["weights"]}))
+    with pytest.raises(ValueError, match=r"weights in .* must sum to 1.*got 2\.0000"):
+        load_body(path)
+    np.savez(path, **(smpl | {"v_template": smpl["v_template"] * np.nan}))
+    with pytest.raises(ValueError, match=r"v_template in .* must be finite: got 180 NaN"):
         load_body(path)
     np.savez(
         path,

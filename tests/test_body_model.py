@@ -41,7 +41,7 @@ def _unhooked(method):
     return inspect.unwrap(method)
 
 
-@pytest.mark.parametrize("joints", [24, 52, 55])
+@pytest.mark.parametrize("joints", [24, 55])
 def test_equals_the_slow_reference(dtype, rng, joints):
     smpl = synthetic_smpl(rng, joints)
     body = _model(smpl, dtype)

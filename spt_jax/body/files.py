@@ -48,8 +48,9 @@ def load_body(
         FileNotFoundError: there is no such file.
         TypeError: `dtype` is not a floating-point dtype.
         ValueError: the suffix is unknown; the file is damaged, lacks an array, or has one of the
-            wrong shape; a pickle names something that is not admitted (RefusedPickleError);
-            `num_shape` is negative; or `dtype` is float64 without jax_enable_x64.
+            wrong shape or with impossible values; a pickle names something that is not admitted
+            (RefusedPickleError); `num_shape` is negative; or `dtype` is float64 without
+            jax_enable_x64.
 
     Example:
         >>> from spt_jax.body import load_body
@@ -198,6 +199,13 @@ def _from_smpl(
             f"f in {path} must index into v_template: got indices {faces.min()} to {faces.max()} "
             f"for {vertices} vertices; indices are 0-based."
         )
+    totals = arrays["weights"].sum(axis=1)
+    if totals.size and np.abs(totals - 1).max() > 1e-3:
+        worst = int(np.abs(totals - 1).argmax())
+        raise ValueError(
+            f"weights in {path} must sum to 1 for each vertex: got {totals[worst]:.4f} for vertex "
+            f"{worst}; divide each row by its sum."
+        )
     shapes = arrays["shapedirs"].astype(np.float64)
     if joints == 55:
         shapes = shapes[..., : _SMPLX_SHAPE.get(shapes.shape[-1], shapes.shape[-1])]
@@ -227,6 +235,11 @@ def _check_shape(name: str, array: np.ndarray, shape: tuple, path: Path) -> None
         raise ValueError(
             f"{name} in {path} must be numbers of shape ({wanted}): got dtype {array.dtype} and "
             f"shape {array.shape}; the file is damaged, or not an SMPL model."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(
+            f"{name} in {path} must be finite: got {np.count_nonzero(~np.isfinite(array))} NaN or "
+            "infinite entries; the file is damaged: download it again."
         )
 
 

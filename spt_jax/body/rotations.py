@@ -47,8 +47,9 @@ def matrix_from_axis_angle(axis_angle: Float[Array, "*batch 3"]) -> Float[Array,
     Example:
         >>> import jax.numpy as jnp
         >>> from spt_jax.body.rotations import matrix_from_axis_angle
-        >>> matrix_from_axis_angle(jnp.array([0.0, 0.0, jnp.pi / 2])).round(3).tolist()
-        [[-0.0, -1.0, 0.0], [1.0, -0.0, 0.0], [-0.0, 0.0, 1.0]]
+        >>> quarter_turn = matrix_from_axis_angle(jnp.array([0.0, 0.0, jnp.pi / 2]))
+        >>> jnp.rint(quarter_turn @ jnp.array([1.0, 0.0, 0.0])).astype(int).tolist()
+        [0, 1, 0]
     """
     squared = jnp.sum(axis_angle * axis_angle, axis=-1)
     small = squared < _SERIES_BELOW
