@@ -5,7 +5,7 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Integer
 
 from spt_jax.rays.beam import Rays, orthogonal_directions
 from spt_jax.rays.measure import Directions
@@ -14,7 +14,7 @@ from spt_jax.rays.measure import Directions
 _MOST_RAYS = 16384
 
 
-def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Int[Array, "F 3"]]:
+def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Integer[Array, "F 3"]]:
     """The mesh as JAX arrays.
 
     Raises:
@@ -58,14 +58,14 @@ def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Int[
 
 def check_indices(faces: np.ndarray, num_vertices: int) -> None:
     """Raise ValueError unless every index names a vertex."""
-    for wrong in (faces.min(initial=0), faces.max(initial=-1)):
-        if wrong < 0 or wrong >= num_vertices:
-            if wrong < 0 and faces.size == 0:
-                continue
-            raise ValueError(
-                f"faces must index into vertices: got index {wrong} for {num_vertices} vertices; "
-                "indices are 0-based."
-            )
+    if faces.size == 0:
+        return
+    lowest, highest = int(faces.min()), int(faces.max())
+    if lowest < 0 or highest >= num_vertices:
+        raise ValueError(
+            f"faces must index into vertices: got index {lowest if lowest < 0 else highest} for "
+            f"{num_vertices} vertices; indices are 0-based."
+        )
 
 
 def as_rays(rays: Any) -> Rays:
@@ -81,7 +81,9 @@ def as_rays(rays: Any) -> Rays:
         )
     pair = isinstance(rays, (tuple, list)) and len(rays) == 2
     sides = rays if pair else (rays,)
-    if not all(isinstance(side, (int, np.integer)) and not isinstance(side, bool) for side in sides):
+    if not all(
+        isinstance(side, (int, np.integer)) and not isinstance(side, bool) for side in sides
+    ):
         raise TypeError(
             f"rays must be a whole number or (rows, columns): got {rays!r}; 512 is a good start."
         )

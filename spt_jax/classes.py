@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int8
+from jaxtyping import Array, Bool, Float, Int8, Integer
 
 from spt_jax.arguments import as_choice, as_directions, as_mesh, as_rays
 from spt_jax.host import call_on_host
@@ -51,7 +51,7 @@ class VertexClasses(eqx.Module):
 
 def classify_vertices(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
-    faces: Int[Array, "F 3"] | np.ndarray,
+    faces: Integer[Array, "F 3"] | np.ndarray,
     *,
     rays: int | tuple[int, int] | str = 512,
     directions: Any = 3,
@@ -95,7 +95,9 @@ def classify_vertices(
     as_choice("rule", rule, Rule)
     if rule == "vertex":
         raise ValueError('rule="vertex" is not in this version: got "vertex"; use "triangle".')
-    return VertexClasses(_labels(Sampling(as_rays(rays), as_directions(directions)), vertices, faces))
+    return VertexClasses(
+        _labels(Sampling(as_rays(rays), as_directions(directions)), vertices, faces)
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)

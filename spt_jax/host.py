@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Integer
 
 from spt_jax.rays.measure import Map
 
@@ -42,7 +42,7 @@ def call_on_host(
     options: Hashable,
     results: tuple[ResultSpec, ...],
     vertices: Float[Array, "*batch V 3"],
-    faces: Int[Array, "F 3"],
+    faces: Integer[Array, "F 3"],
 ) -> tuple[Array, ...]:
     """Run a NumPy function once per mesh of the batch, on as many threads as the process may use.
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import as_backend, as_choice, as_directions, as_mesh, as_rays
 from spt_jax.host import call_on_host
@@ -16,7 +16,7 @@ from spt_jax.rays.measure import Gradient, Map, Sampling, Value
 
 def self_intersection_penalty(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
-    faces: Int[Array, "F 3"] | np.ndarray,
+    faces: Integer[Array, "F 3"] | np.ndarray,
     *,
     value: Value = "volume",
     gradient: Gradient = "boundary",
@@ -95,7 +95,7 @@ def self_intersection_penalty(
 
 def paper_penalty(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
-    faces: Int[Array, "F 3"] | np.ndarray,
+    faces: Integer[Array, "F 3"] | np.ndarray,
     *,
     rays: int | tuple[int, int] = 512,
     normalize: bool = True,

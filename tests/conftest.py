@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from jaxtyping import install_import_hook
+from jaxtyping import config, install_import_hook
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -34,3 +34,11 @@ def x64():
 def rng():
     """One seeded generator a test."""
     return np.random.default_rng(0)
+
+
+@pytest.fixture
+def untyped():
+    """Run as users do, without the type checks that this suite adds, so that our own errors show."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)

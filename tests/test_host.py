@@ -1,0 +1,104 @@
+"""The bridge to the host: no deadlock, no crash at exit, threads that change nothing."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import join, sphere
+
+from spt_jax import host, self_intersection_penalty
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+
+def run(*arguments, timeout):
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)], timeout=timeout, capture_output=True, text=True
+    )
+
+
+def test_no_deadlock():
+    """https://github.com/jax-ml/jax/issues/24255, https://github.com/jax-ml/jax/issues/25861.
+
+    With whole arrays instead of pieces the program hangs at 147 kB.
+    """
+    done = run(SCRIPTS / "no_deadlock.py", timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("finished") == 2
+
+
+def test_work_that_nobody_waits_for_does_not_crash_the_exit():
+    done = run(SCRIPTS / "exit_without_waiting.py", timeout=100)
+    assert (done.returncode, done.stdout.strip()) == (0, "end"), done.stderr
+
+
+def test_pieces_are_small_and_complete():
+    array = jnp.arange(100_000, dtype="float32").reshape(-1, 2)
+    pieces = host._pieces(array)
+    assert len(pieces) == 5 and max(piece.nbytes for piece in pieces) <= 96 * 1024
+    np.testing.assert_array_equal(host._join(pieces, array.shape, np.float64), array)
+    assert host._join((), (0, 3), np.float64).shape == (0, 3)
+
+
+def test_operands_stay_small_under_vmap():
+    """A batch must not make the pieces larger: the rule cuts the joined batch again."""
+    vertices, faces = join(sphere(subdivisions=3), sphere(subdivisions=3))
+    batch = jnp.zeros((5, 4, *vertices.shape), "float32")
+    closed = jax.make_jaxpr(
+        jax.vmap(jax.vmap(lambda v: self_intersection_penalty(v, faces, rays=8)))
+    )(batch)
+    sizes = _callback_operand_bytes(closed.jaxpr)
+    assert sum(sizes) >= batch.nbytes and max(sizes) <= 96 * 1024
+
+
+def _callback_operand_bytes(jaxpr):
+    sizes = []
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "pure_callback":
+            sizes += [v.aval.size * v.aval.dtype.itemsize for v in equation.invars]
+        for value in equation.params.values():
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                sizes += _callback_operand_bytes(inner)
+    return sizes
+
+
+def test_threads_do_not_change_the_result(monkeypatch):
+    vertices, faces = join(sphere(), sphere(center=(1.1, 0.2, 0.1)))
+    batch = jnp.stack([jnp.asarray(vertices * s, "float32") for s in (1.0, 1.1, 1.2)])
+    step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=64).sum())
+    threaded = jax.block_until_ready(step(batch))
+    monkeypatch.setattr(host, "_usable_cores", lambda: 1)
+    alone = jax.block_until_ready(step(batch))
+    assert threaded[0] == alone[0]
+    np.testing.assert_array_equal(threaded[1], alone[1])
+
+
+def test_a_pool_that_takes_no_more_work_is_done_without(monkeypatch):
+    class Closed:
+        def submit(self, *_):
+            raise RuntimeError("cannot schedule new futures after interpreter shutdown")
+
+    monkeypatch.setattr(host, "_executor", Closed)
+    assert host.parallel_map(lambda x: x + 1, [1, 2, 3]) == [2, 3, 4]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_child_gets_threads_of_its_own():
+    host.parallel_map(abs, [-1, -2])
+    reader, writer = os.pipe()
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX and Python warn of forks in threaded processes
+        child = os.fork()
+    if child == 0:
+        os.write(writer, str(sum(host.parallel_map(abs, [-3, -4]))).encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(reader, 10) == b"7"
