@@ -105,7 +105,7 @@ class IntersectionReport:
         for direction, volume, crossings, lost in zip(
             self.directions, self.volumes, self.crossings, self.open_rays, strict=True
         ):
-            axis = " ".join(f"{x + 0.0:+.3g}" for x in direction)
+            axis = _axis_name(direction)
             note = f", [red]{lost} rays through a hole left out[/red]" if lost else ""
             table.add_row(f"along {axis}", f"{volume:.4g} unit³, {crossings:,} crossings{note}")
         return table
@@ -169,6 +169,13 @@ def intersection_report(
         crossings=tuple(b.crossings for b in beams) or (0,) * len(sampling.directions),
         open_rays=tuple(b.open_rays for b in beams) or (0,) * len(sampling.directions),
     )
+
+
+def _axis_name(direction: tuple[float, float, float]) -> str:
+    for k, letter in enumerate("xyz"):
+        if abs(direction[k]) == 1:
+            return f"{'+' if direction[k] > 0 else '-'}{letter}"
+    return " ".join(f"{x:+.2f}" for x in direction)
 
 
 def _solid_volume(points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:

@@ -1,0 +1,8 @@
+"""`python -m spt_jax`, the same as `spt-jax`."""
+
+import sys
+
+from spt_jax.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

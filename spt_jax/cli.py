@@ -1,0 +1,38 @@
+"""The command line: spt-jax demo, check and untangle."""
+
+import sys
+from collections.abc import Sequence
+
+import tyro
+
+from spt_jax.commands.check import check
+from spt_jax.commands.demo import demo
+from spt_jax.commands.terminal import CommandError
+from spt_jax.commands.untangle import untangle
+
+_COMMANDS = {"demo": demo, "check": check, "untangle": untangle}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code.
+
+    0: done. 1: `check` found a self-intersection. 2: the input or the output folder is at fault,
+    said in one line on the standard error stream. 130: interrupted.
+
+    Args:
+        args: the words after `spt-jax`; those of the process if None.
+    """
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            _COMMANDS,
+            prog="spt-jax",
+            description="See and remove self-intersections of triangle meshes and body models.",
+            args=args,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except CommandError as error:
+        print(f"spt-jax: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("spt-jax: interrupted; no file is left half-written", file=sys.stderr)
+        return 130

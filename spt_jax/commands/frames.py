@@ -1,0 +1,188 @@
+"""Frames untangled one after the other, with what is shown and written of them."""
+
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from spt_jax.commands.terminal import State
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spt_jax.body import BodyModel
+    from spt_jax.report import IntersectionReport
+
+_CUBIC_CENTIMETRES = 1e6  # in a cubic metre
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Frames of one body: names, poses in the body's own joints, and what goes with them."""
+
+    names: list[str]
+    pose: Float[np.ndarray, "N J 3"]
+    shape: Float[np.ndarray, "N B"] | None = None
+    translation: Float[np.ndarray, "N 3"] | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame before and after."""
+
+    name: str
+    pose: Float[np.ndarray, "J 3"]
+    vertices_before: Float[np.ndarray, "V 3"]
+    vertices_after: Float[np.ndarray, "V 3"]
+    before: "IntersectionReport"
+    after: "IntersectionReport"
+    steps: int
+    seconds: float
+
+    @property
+    def file_name(self) -> str:
+        """The name as a part of a file's name: "crawl/0012" becomes "crawl_0012"."""
+        return re.sub(r"[^\w.-]+", "_", self.name).lstrip(".") or "frame"
+
+
+def untangle_frames(
+    body: "BodyModel", motion: Motion, *, rays: int, directions: int, state: State
+) -> list[Frame]:
+    """Report on each frame, untangle it, and report again."""
+    from spt_jax.fit.untangle import untangle_pose
+    from spt_jax.report import intersection_report
+
+    frames = []
+    for k, name in enumerate(motion.names):
+        state(name, done=k)
+        start = time.perf_counter()
+        shape = None if motion.shape is None else motion.shape[k]
+        translation = None if motion.translation is None else motion.translation[k]
+
+        def on_step(stage: int, steps: int, volume: float, name: str = name) -> None:
+            volume = float(volume) * _CUBIC_CENTIMETRES
+            state(f"{name}: stage {int(stage)}, step {int(steps)}, {volume:.1f} cm³")
+
+        vertices = np.asarray(body(motion.pose[k], shape, translation).vertices)
+        before = intersection_report(vertices, body.faces, rays=rays, directions=directions)
+        result = untangle_pose(
+            body,
+            motion.pose[k],
+            shape=shape,
+            translation=translation,
+            rays=rays,
+            directions=directions,
+            on_step=on_step,
+        )
+        untangled = np.asarray(result.vertices)
+        frames.append(
+            Frame(
+                name=name,
+                pose=np.asarray(result.pose),
+                vertices_before=vertices,
+                vertices_after=untangled,
+                before=before,
+                after=intersection_report(untangled, body.faces, rays=rays, directions=directions),
+                steps=int(result.steps),
+                seconds=time.perf_counter() - start,
+            )
+        )
+    return frames
+
+
+def before_after_table(frames: Sequence[Frame]) -> "Table":
+    """The table that people read: one row a frame."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(header_style="bold")
+    table.add_column("frame", no_wrap=True)
+    for heading in ("ratio\nbefore", "\nafter", "overlap\nbefore", "\nafter", "\nsteps", "\ntime"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for frame in frames:
+        colour = "green" if frame.after.volume < 0.01 * frame.before.volume else "default"
+        table.add_row(
+            escape(frame.name),
+            f"{frame.before.ratio:.2%}",
+            f"[{colour}]{frame.after.ratio:.2%}[/{colour}]",
+            f"{frame.before.volume * _CUBIC_CENTIMETRES:.2f} cm³",
+            f"[{colour}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f} cm³[/{colour}]",
+            str(frame.steps),
+            f"{frame.seconds:.1f} s",
+        )
+    return table
+
+
+def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -> dict[str, Any]:
+    """What report.json holds."""
+    return {
+        "command": command,
+        "versions": _versions(),
+        "settings": settings,
+        "units": {"length": "m", "volume": "m^3", "time": "s", "angle": "rad"},
+        "frames": [
+            {
+                "name": frame.name,
+                "before": frame.before.as_dict(),
+                "after": frame.after.as_dict(),
+                "steps": frame.steps,
+                "seconds": round(frame.seconds, 3),
+            }
+            for frame in frames
+        ],
+    }
+
+
+def write_meshes(
+    folder: Path, frames: Sequence[Frame], faces: Any, suffixes: Sequence[str]
+) -> list[str]:
+    """Write each frame's meshes before and after, coloured by class; return the files' names."""
+    from spt_jax.mesh_files import write_mesh
+
+    names, written = _file_names(frames), []
+    for frame, name in zip(frames, names, strict=True):
+        for when, vertices, report in (
+            ("before", frame.vertices_before, frame.before),
+            ("after", frame.vertices_after, frame.after),
+        ):
+            for suffix in suffixes:
+                written.append(f"{name}_{when}{suffix}")
+                write_mesh(folder / written[-1], vertices, np.asarray(faces), report.labels)
+    return written
+
+
+def write_motion(path: Path, frames: Sequence[Frame], motion: Motion) -> None:
+    """Write the untangled poses, with the shapes and translations that came with them."""
+    from spt_jax.fit.pose_files import write_poses
+
+    write_poses(
+        path,
+        np.stack([frame.pose for frame in frames]),
+        shape=motion.shape,
+        translation=motion.translation,
+        names=motion.names,
+    )
+
+
+def _file_names(frames: Sequence[Frame]) -> list[str]:
+    names = [frame.file_name for frame in frames]
+    # "a/b" and "a_b" would share a file.
+    return [name if names.count(name) == 1 else f"{name}_{k}" for k, name in enumerate(names)]
+
+
+def _versions() -> dict[str, str]:
+    import platform
+
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in ("spt-jax", "jax", "jaxlib", "numpy", "equinox", "optimistix"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # run from a folder of sources
+            found[package] = "not installed"
+    return found

