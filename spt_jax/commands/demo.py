@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from spt_jax.commands.terminal import (
     show,
     user_errors,
 )
+
+if TYPE_CHECKING:
+    from spt_jax.commands.frames import Frame
 
 # Chosen by classifying all 1,086 bundled frames at 3 x 256 rays and looking at those with the most
 # overlap of each motion: collisions of a body part with a distant one, each of another kind, with
@@ -31,6 +34,7 @@ DEMO_FRAMES = (
 )
 
 _RAYS, _DIRECTIONS = 512, 3
+_GUTTER = 24  # pixels between the halves of the picture
 
 
 def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
@@ -58,6 +62,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
             Motion,
             as_report,
             before_after_table,
+            summary,
             untangle_frames,
             write_meshes,
             write_motion,
@@ -83,6 +88,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
             write_json(folder / "report.json", report)
     console = out_console(quiet)
     console.print(before_after_table(done))
+    show(console, summary(done))
     pictures = "" if missing else "before_after.png, "
     show(
         console,
@@ -94,19 +100,34 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
     return 0
 
 
-def _draw(path: Path, frames: list[Any], faces: Any) -> str | None:
+def _draw(path: Path, frames: list["Frame"], faces: Any) -> str | None:
     """Draw the picture, or say why there is none."""
-    from spt_jax.show import RenderingUnavailable, render_before_after
+    from spt_jax.files import atomic_write
+    from spt_jax.show import RenderingUnavailable, render_strip
 
+    # Two blocks of rows side by side: one above the other is too tall for a page or a screen.
+    half = (len(frames) + 1) // 2
+    blocks = [block for block in (frames[:half], frames[half:]) if block]
     try:
-        render_before_after(
-            [frame.vertices_before for frame in frames],
-            [frame.vertices_after for frame in frames],
-            faces,
-            [frame.before.labels for frame in frames],
-            [frame.after.labels for frame in frames],
-            path=path,
-        )
+        pictures = [
+            render_strip(
+                [[frame.vertices_before, frame.vertices_after] for frame in block],
+                faces,
+                [[frame.before.labels, frame.after.labels] for frame in block],
+                ["before", "after"],
+                row_titles=[frame.name for frame in block],
+                size=(320, 400),
+            )
+            for block in blocks
+        ]
+        from PIL import Image
     except (ImportError, RenderingUnavailable) as error:
         return " ".join(str(error).split())
+    height, width, _ = pictures[0].shape
+    page = np.full((height, len(pictures) * (width + _GUTTER) - _GUTTER, 3), 255, np.uint8)
+    for k, picture in enumerate(pictures):
+        x = k * (width + _GUTTER)
+        page[: len(picture), x : x + width] = picture
+    with atomic_write(path) as temporary:
+        Image.fromarray(page).save(temporary, format="PNG", optimize=True)
     return None

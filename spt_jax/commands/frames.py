@@ -103,7 +103,15 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
 
     table = Table(header_style="bold")
     table.add_column("frame", no_wrap=True)
-    for heading in ("ratio\nbefore", "\nafter", "overlap\nbefore", "\nafter", "\nsteps", "\ntime"):
+    headings = (
+        "ratio\nbefore",
+        "ratio\nafter",
+        "overlap\nbefore",
+        "overlap\nafter",
+        "steps",
+        "time",
+    )
+    for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     for frame in frames:
         colour = "green" if frame.after.volume < 0.01 * frame.before.volume else "default"
@@ -117,6 +125,17 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
             f"{frame.seconds:.1f} s",
         )
     return table
+
+
+def summary(frames: Sequence[Frame]) -> str:
+    """All frames in one line."""
+    before, after = (
+        sum(getattr(frame, when).volume for frame in frames) * _CUBIC_CENTIMETRES
+        for when in ("before", "after")
+    )
+    change = f" ({after / before - 1:+.2%})" if before else ""
+    count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
+    return f"{count}: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after{change}"
 
 
 def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -> dict[str, Any]:

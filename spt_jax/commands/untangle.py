@@ -58,6 +58,7 @@ def untangle(
         from spt_jax.commands.frames import (
             as_report,
             before_after_table,
+            summary,
             untangle_frames,
             write_meshes,
             write_motion,
@@ -82,6 +83,7 @@ def untangle(
         return 0
     console = out_console(quiet)
     console.print(before_after_table(done))
+    show(console, summary(done))
     also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
     show(console, f"in {folder}: poses.npz, report.json{also}")
     return 0
