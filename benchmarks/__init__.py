@@ -1,0 +1,1 @@
+"""Measurements of spt_jax, one file a question; `results.md` holds what they printed."""
