@@ -1,7 +1,7 @@
 """The paper's figures 5, 6 and 7 (sections 4.1 and 4.2) on the embedded body.
 
-`python -m benchmarks.paper_figures [--out DIR] [--record]`: two to four minutes on two cores. What is
-run, and why, is in `paper_runs`.
+`python -m benchmarks.paper_figures [--out DIR] [--record]`: two to four minutes on two cores. What
+is run, and why, is in `paper_runs`.
 """
 
 import time
