@@ -206,7 +206,7 @@ def _reading(singles: Singles, pairs: Pairs) -> str:
 - Rate 1e-4 with Eq. 10 lowers the average in 30 iterations from {mean[0]:.4f} to
   {mean[30]:.4f}, and to {mean[300]:.4f} after 300 (best {mean.min():.4f}): it works, but is far
   from done in 30 iterations, and the value was still falling at 300.
-- The value is a count and its gradient unit vectors, so it rises at a third of the steps. Part of
+- The value is a count and its gradient unit vectors, so it rises at 3 steps in 10. Part of
   what stays are creases of the skin at the armpits, which walk/0010 has as captured (0.0062,
   31 cm3), and the whole-triangle rule, which labels every corner of a triangle that is touched.
 - Eq. 9 at the rate 1e-4 moves nothing: its vectors are areas, 3e-7 to 1.4e-3 m2 on the body at
