@@ -8,8 +8,6 @@ from jaxtyping import Array, Float, Int, Int8
 
 from spt_jax.arguments import as_directions, as_rays
 from spt_jax.host import parallel_map
-from spt_jax.mesh_check import MeshCheck as MeshCheck
-from spt_jax.mesh_check import check_mesh as check_mesh
 from spt_jax.mesh_check import one_mesh
 from spt_jax.rays import measure
 from spt_jax.rays.beam import Rays

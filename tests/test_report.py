@@ -1,6 +1,5 @@
 import json
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -273,7 +272,7 @@ def test_report_refuses_what_the_penalty_refuses():
     with pytest.raises(ValueError, match="rays must be from 1"):
         intersection_report(vertices, faces, rays=0)
     with pytest.raises(ValueError, match="one mesh"):
-        intersection_report(jnp.stack([vertices, vertices]), faces)
+        intersection_report(np.stack([vertices, vertices]), faces)
     vertices[0] = np.nan
     with pytest.raises(ValueError, match="vertices must be finite: got NaN or infinity in 1 of 8"):
         intersection_report(vertices, faces)

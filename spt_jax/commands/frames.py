@@ -54,7 +54,7 @@ class Frame:
 def untangle_frames(
     body: "BodyModel", motion: Motion, *, rays: int, directions: int, state: State
 ) -> list[Frame]:
-    """Report on each frame, untangle it, and report again."""
+    """Report on each frame with so many rays, untangle it, and report again."""
     from spt_jax.fit.untangle import untangle_pose
     from spt_jax.report import intersection_report
 
@@ -76,7 +76,7 @@ def untangle_frames(
             motion.pose[k],
             shape=shape,
             translation=translation,
-            rays=rays,
+            rays=max(rays // 2, 1),  # it measures with twice as many as it searches with
             directions=directions,
             on_step=on_step,
         )

@@ -39,7 +39,7 @@ def untangle(
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
             (.npz, .pkl).
         meshes: write a .glb of each frame before and after, coloured by class.
-        rays: rays along the longer side of each of the three beams.
+        rays: rays along the longer side of each of the three beams; the search uses half as many.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
