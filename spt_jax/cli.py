@@ -1,7 +1,9 @@
 """The command line: spt-jax demo, check and untangle."""
 
+import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 import tyro
 
@@ -35,4 +37,15 @@ def main(args: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print("spt-jax: interrupted; no file is left half-written", file=sys.stderr)
+        if args is None:
+            _leave_at_once(130)
         return 130
+
+
+def _leave_at_once(code: int) -> NoReturn:
+    # The interrupted computation goes on in XLA's threads and calls back into Python; one that
+    # does so while the interpreter shuts down ends the process with a segmentation fault (3 of 4
+    # interrupted demos). Files are whole by now, so there is nothing that shutting down would do.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

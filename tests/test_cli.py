@@ -1,7 +1,9 @@
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -212,6 +214,25 @@ def test_interrupted_while_it_works(command, tmp_path, capsys, monkeypatch):
     captured = capsys.readouterr()
     assert captured.err == "spt-jax: interrupted; no file is left half-written\n"
     assert captured.out == "" and files_in(out) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT is sent to a process")
+def test_ctrl_c_ends_the_process_cleanly_in_the_middle_of_a_computation(tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "spt_jax", "demo", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        for _ in range(600):
+            if out.exists():
+                break
+            time.sleep(0.1)
+        time.sleep(5)  # well into the first frame, whose solver calls back into Python
+        process.send_signal(signal.SIGINT)
+        printed = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert printed == ("", "spt-jax: interrupted; no file is left half-written\n")
+    assert process.returncode == 130 and files_in(out) == []
 
 
 def test_interrupted_while_it_writes(calls, tmp_path, capsys, monkeypatch):
