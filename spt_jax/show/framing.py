@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 View = str | tuple[float, float]
 """A name of `NAMED_VIEWS`, "auto", or (azimuth, elevation) in degrees.
@@ -88,6 +88,21 @@ def frame(
     return Framing(axes, (low + high) / 2 @ axes, max(half, 1e-9), max(depth, 1e-9))
 
 
+def marked_triangles(
+    labels: Int[np.ndarray, "V"], faces: Int[np.ndarray, "F 3"]
+) -> Bool[np.ndarray, "F"]:
+    """The triangles to colour: all corners labelled, or a labelled corner that has no such triangle.
+
+    The triangle rule labels every corner of a crossed triangle; colouring each triangle with one
+    labelled corner would add another ring around what is already the outermost.
+    """
+    labelled = labels != 0
+    whole = labelled[faces].all(axis=1)
+    lonely = labelled.copy()
+    lonely[faces[whole]] = False
+    return whole | lonely[faces].any(axis=1)
+
+
 def _best_azimuth(
     meshes: Sequence[np.ndarray], faces: Int[np.ndarray, "F 3"], labels: Sequence[np.ndarray]
 ) -> float:
@@ -96,7 +111,7 @@ def _best_azimuth(
     # gains under a third, go to the direction nearer the front.
     scores = np.zeros(len(_AZIMUTHS))
     for vertices, classes in zip(meshes, labels, strict=True):
-        marked = (classes[faces] != 0).any(axis=1)
+        marked = marked_triangles(classes, faces)
         if not marked.any():
             continue
         corners = vertices[faces]

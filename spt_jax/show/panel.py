@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
-from spt_jax.show.framing import Framing
+from spt_jax.show.framing import Framing, marked_triangles
 from spt_jax.show.offscreen import import_extra, offscreen_plotter
 
 _BACKGROUND = (246, 244, 240)
@@ -53,10 +53,10 @@ def draw_panel(
         plotter.add_light(light)
     _aim(plotter, camera)
 
-    corners = labels[faces]
-    out, inside = (corners > 0).any(axis=1), (corners < 0).any(axis=1)
-    marked = out | inside
-    colours = np.array([BODY_COLOUR, OUT_COLOUR, IN_COLOUR], np.uint8)[np.where(out, 1, 2 * inside)]
+    marked = marked_triangles(labels, faces)
+    out = (labels[faces] > 0).any(axis=1)
+    kind = marked * np.where(out, 1, 2)
+    colours = np.array([BODY_COLOUR, OUT_COLOUR, IN_COLOUR], np.uint8)[kind]
     normals = _vertex_normals(vertices, faces)
     body = _add_surface(plotter, vertices, faces, normals, colours)
     plotter.render()  # screenshot alone would return what was drawn last

@@ -36,9 +36,10 @@ def render_mesh(
 ) -> Picture:
     """Return a picture of one mesh, with its labelled triangles seen through the rest.
 
-    A triangle is coloured when any of its vertices is labelled: V_out (+1) vermillion, before V_in
-    (-1) blue. Overlapping parts hide each other, so coloured triangles are drawn a second time over
-    the finished picture: what lies inside the body shows as a fainter spot.
+    A triangle is coloured when all of its vertices are labelled, or one that would otherwise not be
+    seen: V_out (+1) vermillion, before V_in (-1) blue. Overlapping parts hide each other, so
+    coloured triangles are drawn a second time over the finished picture: what lies inside the body
+    shows as a fainter spot.
 
     Args:
         vertices: positions, in any unit; the picture is fitted to them.
