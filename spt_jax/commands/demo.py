@@ -74,11 +74,11 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
         motion = Motion(list(DEMO_FRAMES[:frames]), pose)
         done = untangle_frames(body, motion, rays=_RAYS, directions=_DIRECTIONS, state=state)
         with user_errors():
-            state("drawing", done=frames)
-            missing = _draw(folder / "before_after.png", done, body.faces)
-            state("writing")
+            state("writing", done=frames)
             meshes = write_meshes(folder, done, body.faces, (".glb", ".ply"))
             write_motion(folder / "poses.npz", done, motion)
+            state("drawing")  # after the rest is safe
+            missing = _draw(folder / "before_after.png", done, body.faces)
             settings = {"body": "anny", "rays": _RAYS, "directions": _DIRECTIONS}
             report = as_report("demo", done, settings)
             report["seconds"] = round(time.perf_counter() - start, 3)
