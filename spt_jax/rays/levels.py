@@ -63,7 +63,9 @@ def find_overlaps(
     # Adjacent overlapped gaps form a run; crossings gap and gap + 1 bound each gap.
     new_run = np.concatenate([[True], np.diff(gap) > 1])[: len(gap)]
     run = np.cumsum(new_run) - 1
-    crossing = np.union1d(gap, gap + 1)
+    bounds = np.zeros(len(winding) + 1, bool)
+    bounds[gap] = bounds[gap + 1] = True
+    crossing = np.flatnonzero(bounds)
     start = np.searchsorted(crossing, gap)
     face, ray = crossings.face[crossing], crossings.ray[crossing]
     barycentric = _barycentric(beam, points, faces[face], ray)
@@ -85,13 +87,12 @@ def _barycentric(
     beam: Beam, points: ScreenPoints, corners: Int[np.ndarray, "K 3"], ray: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "K 3"]:
     row, column = np.divmod(ray, beam.shape[1])
-    x = points.column[corners] - column[:, None]
-    y = points.row[corners] - row[:, None]
-    x_next, y_next = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    x_last, y_last = np.roll(x, -2, axis=1), np.roll(y, -2, axis=1)
-    part = x_next * y_last - y_next * x_last
-    total = part.sum(axis=1, keepdims=True)
-    weights = np.clip(part / np.where(total != 0, total, 1.0), 0.0, 1.0)
+    x0, x1, x2 = points.column[corners.T] - column
+    y0, y1, y2 = points.row[corners.T] - row
+    weights = np.stack([x1 * y2 - y1 * x2, x2 * y0 - y2 * x0, x0 * y1 - y0 * x1])
+    total = weights.sum(axis=0)
+    weights /= np.where(total != 0, total, 1.0)
+    np.clip(weights, 0.0, 1.0, out=weights)
     # A triangle with no area on the screen was crossed by rounding alone: take its centre.
-    whole = weights.sum(axis=1, keepdims=True)
-    return np.where(whole > 0, weights / np.where(whole > 0, whole, 1.0), 1.0 / 3.0)
+    whole = weights.sum(axis=0)
+    return np.where(whole > 0, weights / np.where(whole > 0, whole, 1.0), 1.0 / 3.0).T

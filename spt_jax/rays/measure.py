@@ -54,9 +54,9 @@ def probe(
 
     def along(direction: tuple[float, float, float]) -> Probe:
         beam, points = aim(vertices, np.array(direction), sampling.rays)
-        crossings = cast(beam, points, faces)
+        crossings = cast(beam, points, faces, simple_rays=False)
         overlaps = find_overlaps(beam, points, faces, crossings)
-        return Probe(beam, overlaps, len(crossings.ray), crossings.open_rays)
+        return Probe(beam, overlaps, crossings.met, crossings.open_rays)
 
     return list(map_directions(along, sampling.directions))
 
