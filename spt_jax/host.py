@@ -15,6 +15,7 @@ Three traps shape this file:
 
 import atexit
 import functools
+import math
 import os
 import threading
 import time
@@ -103,6 +104,16 @@ def _host_entry(function, options, results, vertices_shape, faces_shape):
     """The callback itself, the same object for the same work so that XLA's caches are hit."""
 
     def run_on_host(vertex_pieces, face_pieces):
+        with _traffic:
+            return measured(vertex_pieces, face_pieces)
+
+    def measured(vertex_pieces, face_pieces):
+        if _traffic.leaving:
+            num_meshes = vertices_shape[0]
+            return tuple(
+                np.full((num_meshes, *shape), np.nan if dtype.startswith("float") else 0, dtype)
+                for shape, dtype in results
+            )
         vertices = _join(vertex_pieces, vertices_shape, np.float64)
         faces = _join(face_pieces, faces_shape, np.int64)
         meshes = list(zip(vertices, np.broadcast_to(faces, (len(vertices), *faces_shape[1:]))))
@@ -158,19 +169,47 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_executor.cache_clear)
 
 
-_LONGEST_WAIT_AT_EXIT = 5.0  # seconds
+class _Traffic:
+    """Counts the callbacks under way, so that the interpreter does not leave under them."""
+
+    def __init__(self):
+        self.leaving = False
+        self._lock = threading.Lock()
+        self._under_way = 0
+        self._last_end = -math.inf
+
+    def __enter__(self):
+        with self._lock:
+            self._under_way += 1
+
+    def __exit__(self, *_):
+        with self._lock:
+            self._under_way -= 1
+            self._last_end = time.monotonic()
+
+    def is_quiet(self) -> bool:
+        # A solver asks again within milliseconds; a pause this long means that none is running.
+        with self._lock:
+            return self._under_way == 0 and time.monotonic() - self._last_end > 0.05
+
+
+_traffic = _Traffic()
 
 
 @atexit.register
 def _finish_pending_work() -> None:
-    """Let results that nobody waited for arrive before the interpreter goes.
+    """Let work that nobody waited for end before the interpreter goes.
 
-    A callback that asks for Python's lock while the interpreter finalises aborts the process. A
-    script whose last line computes a penalty and reads nothing is enough.
+    A callback that asks for Python's lock while the interpreter finalises kills the process: a
+    script whose last line computes a penalty and reads nothing is enough, or Ctrl-C in a solve.
+    What is under way gets two seconds; then callbacks answer NaN at once, which ends a solver's
+    loop or at least makes its steps cheap.
     """
-    deadline = time.monotonic() + _LONGEST_WAIT_AT_EXIT
-    pause = threading.Event()
-    while time.monotonic() < deadline:
-        if all(array.is_deleted() or array.is_ready() for array in jax.live_arrays("cpu")):
-            return
-        pause.wait(0.005)
+    for leaving, seconds in ((False, 2.0), (True, 5.0)):
+        _traffic.leaving = leaving
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            arrays = jax.live_arrays("cpu")
+            if _traffic.is_quiet() and all(x.is_deleted() or x.is_ready() for x in arrays):
+                return
+            threading.Event().wait(0.005)
