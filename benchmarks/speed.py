@@ -1,0 +1,88 @@
+"""What one call costs: `python -m benchmarks.speed [--record]`. Medians of repeated calls."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from benchmarks.common import Table, provenance, record_section
+from spt_jax import load_body, load_mocap, self_intersection_penalty
+
+FRAME = "crawl/0092"
+
+
+@dataclass
+class Settings:
+    """How often each call is repeated."""
+
+    repeats: int = 30
+    record: bool = False
+    """Write the table into results.md."""
+
+
+def milliseconds(call: Callable[[], Any], repeats: int) -> tuple[float, float, float]:
+    """The 10, 50 and 90 % points of the call's time, after one call that compiles."""
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(1e3 * (time.perf_counter() - start))
+    low, middle, high = np.percentile(times, [10, 50, 90])
+    return float(low), float(middle), float(high)
+
+
+def main(settings: Settings) -> None:
+    body, mocap = load_body(), load_mocap()
+    pose = body.pose_from_smpl(jnp.asarray(mocap.pose[mocap.names.index(FRAME)]))
+    vertices = body(pose).vertices
+    batch = jnp.stack([vertices] * 16)
+
+    def penalty(rays, directions):
+        return jax.jit(
+            jax.value_and_grad(
+                lambda v: self_intersection_penalty(
+                    v, body.faces, rays=rays, directions=directions
+                ).sum()
+            )
+        )
+
+    through_body = jax.jit(
+        jax.value_and_grad(
+            lambda p: self_intersection_penalty(body(p).vertices, body.faces, rays=512)
+        )
+    )
+    only_body = jax.jit(jax.value_and_grad(lambda p: jnp.sum(body(p).vertices ** 2)))
+    three, coarse, one = penalty(512, 3), penalty(256, 3), penalty(512, 1)
+    calls = {
+        "body and its gradient, without the penalty": lambda: only_body(pose),
+        "penalty, 512 x 512 rays, one direction": lambda: one(vertices),
+        "penalty, 256 x 256 rays, three directions": lambda: coarse(vertices),
+        "penalty, 512 x 512 rays, three directions (default)": lambda: three(vertices),
+        "body + penalty, default": lambda: through_body(pose),
+        "penalty, default, batch of 16, per mesh": lambda: three(batch),
+    }
+    rows = []
+    for name, call in calls.items():
+        share = 16 if "batch" in name else 1
+        times = milliseconds(call, settings.repeats // (4 if share > 1 else 1))
+        rows.append((name, *(f"{t / share:.1f}" for t in times)))
+    table = Table(
+        f"Value and gradient under jit, in milliseconds; {len(vertices)} vertices, "
+        f"{len(body.faces)} triangles, frame {FRAME}, float32",
+        ("call", "10 %", "median", "90 %"),
+        rows,
+    )
+    table.print()
+    if settings.record:
+        command = f"python -m benchmarks.speed --repeats {settings.repeats} --record"
+        record_section("speed", "The cost of a call", f"{provenance(command)}\n\n{table.markdown()}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))
