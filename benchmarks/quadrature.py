@@ -1,4 +1,4 @@
-"""How well 512 x 512 rays measure a body's overlap: `python -m benchmarks.quadrature [--record]`."""
+"""How well 512 x 512 rays measure a body's overlap: `python -m benchmarks.quadrature`."""
 
 from dataclasses import dataclass
 
@@ -81,7 +81,9 @@ def main(settings: Settings) -> None:
             f"--rays {settings.rays} --record"
         )
         record_section(
-            "quadrature", "The rays' quadrature error", f"{provenance(command)}\n\n{table.markdown()}"
+            "quadrature",
+            "The rays' quadrature error",
+            f"{provenance(command)}\n\n{table.markdown()}",
         )
 
 

@@ -81,7 +81,9 @@ def main(settings: Settings) -> None:
     table.print()
     if settings.record:
         command = f"python -m benchmarks.speed --repeats {settings.repeats} --record"
-        record_section("speed", "The cost of a call", f"{provenance(command)}\n\n{table.markdown()}")
+        record_section(
+            "speed", "The cost of a call", f"{provenance(command)}\n\n{table.markdown()}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How far `untangle_pose` frees real poses: `python -m benchmarks.untangle [--frames 100] [--record]`."""
+"""How far `untangle_pose` frees real poses: `python -m benchmarks.untangle`."""
 
 import time
 from dataclasses import dataclass

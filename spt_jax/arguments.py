@@ -2,9 +2,9 @@
 
 from typing import Any, Literal, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Integer
 
 from spt_jax.rays.beam import Rays, orthogonal_directions
@@ -49,7 +49,7 @@ def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Inte
             f"faces must have shape (F, 3): got {face_shape}; split other polygons into "
             "triangles, and batch meshes of different faces with jax.vmap."
         )
-    if not isinstance(faces, jax.core.Tracer):
+    if not isinstance(faces, Tracer):
         check_indices(np.asarray(faces), shape[-2])
     if np.issubdtype(given, np.unsignedinteger) or np.dtype(given).itemsize > 4:
         faces = faces.astype(np.int32)
@@ -79,19 +79,21 @@ def as_rays(rays: Any) -> Rays:
             'rays="auto" is not in this version: got "auto"; pass a whole number, such as '
             "rays=512 (the default), or (rows, columns)."
         )
-    pair = isinstance(rays, (tuple, list)) and len(rays) == 2
-    sides = rays if pair else (rays,)
-    if not all(
-        isinstance(side, (int, np.integer)) and not isinstance(side, bool) for side in sides
-    ):
+    if isinstance(rays, (tuple, list)) and len(rays) == 2:
+        return _as_count(rays[0], rays), _as_count(rays[1], rays)
+    return _as_count(rays, rays)
+
+
+def _as_count(side: Any, rays: Any) -> int:
+    if not isinstance(side, (int, np.integer)) or isinstance(side, bool):
         raise TypeError(
             f"rays must be a whole number or (rows, columns): got {rays!r}; 512 is a good start."
         )
-    if any(side < 1 or side > _MOST_RAYS for side in sides):
+    if side < 1 or side > _MOST_RAYS:
         raise ValueError(
             f"rays must be from 1 to {_MOST_RAYS} a side: got {rays!r}; 512 is a good start."
         )
-    return (int(sides[0]), int(sides[1])) if pair else int(sides[0])
+    return int(side)
 
 
 def as_directions(directions: Any) -> Directions:
@@ -102,7 +104,7 @@ def as_directions(directions: Any) -> Directions:
         ValueError: another count than 1 or 3; another shape than (D, 3) with D > 0; a direction
             that is zero or not finite.
     """
-    if isinstance(directions, jax.core.Tracer):
+    if isinstance(directions, Tracer):
         raise TypeError(
             "directions must be known when traced: got a traced array; pass 1, 3 or a NumPy array."
         )

@@ -116,7 +116,8 @@ def _host_entry(function, options, results, vertices_shape, faces_shape):
             )
         vertices = _join(vertex_pieces, vertices_shape, np.float64)
         faces = _join(face_pieces, faces_shape, np.int64)
-        meshes = list(zip(vertices, np.broadcast_to(faces, (len(vertices), *faces_shape[1:]))))
+        faces = np.broadcast_to(faces, (len(vertices), *faces_shape[1:]))
+        meshes = list(zip(vertices, faces, strict=True))
         if len(meshes) == 1:
             found = [function(*meshes[0], options, parallel_map)]
         else:

@@ -144,10 +144,8 @@ class _Options(NamedTuple):
     sampling: Sampling
 
 
-# jit, so that a call outside any jit is traced once and not every time.
-@functools.partial(jax.jit, static_argnums=0)
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _penalty(options, vertices, faces):
+def _differentiable(options, vertices, faces):
     (value,) = call_on_host(_value_on_host, options, (_scalar(vertices),), vertices, faces)
     return value
 
@@ -155,7 +153,8 @@ def _penalty(options, vertices, faces):
 def _penalty_forward(options, vertices, faces):
     results = (_scalar(vertices), (vertices.shape[-2:], vertices.dtype.name))
     # The residual is the gradient: the backward pass never calls the host.
-    return call_on_host(_value_and_gradient_on_host, options, results, vertices, faces)
+    value, gradient = call_on_host(_value_and_gradient_on_host, options, results, vertices, faces)
+    return value, gradient
 
 
 def _penalty_backward(options, gradient, cotangent):
@@ -164,7 +163,9 @@ def _penalty_backward(options, gradient, cotangent):
     return jnp.where(gradient == 0, jnp.zeros_like(product), product), None
 
 
-_penalty.__wrapped__.defvjp(_penalty_forward, _penalty_backward)
+_differentiable.defvjp(_penalty_forward, _penalty_backward)
+# jit, so that a call outside any jit is traced once and not every time.
+_penalty = jax.jit(_differentiable, static_argnums=0)
 
 
 def _scalar(vertices):

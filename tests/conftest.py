@@ -1,4 +1,4 @@
-"""Strictness for the whole suite: types are checked, promotions are explicit, both precisions run."""
+"""Strictness for the whole suite: types checked, promotions explicit, both precisions run."""
 
 import jax
 import numpy as np
@@ -38,7 +38,7 @@ def rng():
 
 @pytest.fixture
 def untyped():
-    """Run as users do, without the type checks that this suite adds, so that our own errors show."""
+    """Run as users do, without the suite's own type checks, so that our errors show."""
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)

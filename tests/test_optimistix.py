@@ -105,6 +105,6 @@ def test_a_solve_can_be_jitted_and_batched(dtype):
 
     starts = jnp.asarray([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0.2, 0]], dtype)
     together = jax.jit(jax.vmap(solve))(starts)
-    for start, end in zip(starts, together):
+    for start, end in zip(starts, together, strict=True):
         assert overlap(end) < 0.1 * overlap(start)
         np.testing.assert_allclose(end, jax.jit(solve)(start), atol=2e-2)

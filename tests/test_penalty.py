@@ -55,21 +55,16 @@ def test_gradient_is_the_derivative_of_the_value(x64):
     check_grads(shifted, (0.0,), order=1, modes=["rev"], eps=1e-7, rtol=1e-3)
 
 
-def test_no_overlap_is_exactly_zero(dtype):
-    for mesh in (sphere(), join(box(), box(center=(1.5, 0, 0)))):
-        for gradient in ("boundary", "vertex", "unit"):
-            for value in ("volume", "ratio"):
-                found, slope = jax.value_and_grad(
-                    lambda v: self_intersection_penalty(
-                        v,
-                        mesh[1],
-                        value=value,
-                        gradient=gradient,
-                        rays=100,  # noqa: B023
-                    )
-                )(as_jax(mesh, dtype))
-                assert found == 0.0
-                np.testing.assert_array_equal(slope, 0.0)
+@pytest.mark.parametrize("value", ["volume", "ratio"])
+@pytest.mark.parametrize("gradient", ["boundary", "vertex", "unit"])
+@pytest.mark.parametrize("mesh", [sphere(), join(box(), box(center=(1.5, 0, 0)))])
+def test_no_overlap_is_exactly_zero(dtype, mesh, gradient, value):
+    options = {"value": value, "gradient": gradient, "rays": 100}
+    found, slope = jax.value_and_grad(lambda v: self_intersection_penalty(v, mesh[1], **options))(
+        as_jax(mesh, dtype)
+    )
+    assert found == 0.0
+    np.testing.assert_array_equal(slope, 0.0)
 
 
 @pytest.mark.parametrize("gradient", ["vertex", "unit"])

@@ -21,8 +21,9 @@ NAMES = [
     "untangle_pose",
 ]
 PARAMETERS = {
-    "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary', rays=512,"
-    " directions=3, margin=0.0, face_groups=None, ignore_groups=(), folds=None, backend='auto'",
+    "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
+    " rays=512, directions=3, margin=0.0, face_groups=None, ignore_groups=(), folds=None,"
+    " backend='auto'",
     "paper_penalty": "vertices, faces, *, rays=512, normalize=True",
     "classify_vertices": "vertices, faces, *, rays=512, directions=3, rule='triangle'",
     "intersection_report": "vertices, faces, *, rays=512, directions=3",

@@ -76,7 +76,11 @@ def test_never_worse_than_the_start():
 @pytest.mark.parametrize(
     ("pose", "options", "message"),
     [
-        (np.zeros((24, 3), "float32"), {}, r"pose must have shape \(\.\.\., 52, 3\): got \(24, 3\)"),
+        (
+            np.zeros((24, 3), "float32"),
+            {},
+            r"shape \(\.\.\., 52, 3\): got \(24, 3\)",
+        ),
         (np.full((52, 3), np.nan, "float32"), {}, "pose must be finite: got 156 values"),
         (np.zeros((0, 52, 3), "float32"), {}, "at least one pose"),
         (np.zeros((52, 3), "float32"), {"weights": ()}, "weights must be positive"),

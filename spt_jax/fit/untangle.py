@@ -139,9 +139,7 @@ def untangle_pose(
     shapes = _per_pose(shape, batch, len(poses))
     translations = _per_pose(translation, batch, len(poses))
     found = [
-        _untangle_one(
-            search, body, *one, weights, steps_per_weight, tolerance, on_step or _nothing
-        )
+        _untangle_one(search, body, *one, weights, steps_per_weight, tolerance, on_step or _nothing)
         for one in zip(poses, shapes, translations, strict=True)
     ]
     if not found:

@@ -20,11 +20,8 @@ import numpy as np
 from spt_jax import self_intersection_penalty
 
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
-BOX_FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-    + [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]],
-    np.int32,
-)
+QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+BOX_FACES = np.array([[a, *pair] for a, b, c, d in QUADS for pair in ((b, c), (c, d))], np.int32)
 
 
 def padded(num_bytes: int) -> tuple[jax.Array, jax.Array]:
