@@ -1,12 +1,15 @@
 """The way from XLA to NumPy and back: the only `pure_callback` of the package.
 
-Three traps shape this file:
+Four traps shape this file:
 
 - On CPU a callback gets its operands as `jax.Array`s, and one above about 100 kB is copied on the
   thread pool that is waiting for the callback: the program hangs
   (https://github.com/jax-ml/jax/issues/24255, https://github.com/jax-ml/jax/issues/25861).
   So arrays travel as pieces of at most 96 kB and are joined here, and a batching rule of our own
   cuts them again where `vmap` would have made every piece larger.
+- The callback runs on another thread, where `with jax.enable_x64(True)` of the caller does not
+  hold: a float64 array would be rounded or refused there. So 8-byte numbers travel as pairs of
+  uint32, both ways.
 - Raising inside a callback is undefined behaviour: what can be wrong in the values comes back as
   NaN, everything else is refused while tracing.
 - The callback has no derivative. `stop_gradient` on its operands keeps outer transformations
@@ -69,11 +72,14 @@ def _bridge(function: HostFunction, options: Hashable, results: tuple[ResultSpec
     @jax.custom_batching.custom_vmap
     def bridge(vertices, faces):
         num_meshes = vertices.shape[0]
-        host = _host_entry(function, options, results, vertices.shape, faces.shape)
-        shapes = tuple(
-            jax.ShapeDtypeStruct((num_meshes, *shape), dtype) for shape, dtype in results
+        mesh = (vertices.shape, vertices.dtype.name), (faces.shape, faces.dtype.name)
+        host = _host_entry(function, options, results, *mesh)
+        shapes = tuple(_words((num_meshes, *shape), dtype) for shape, dtype in results)
+        words = jax.pure_callback(host, shapes, _pieces(vertices), _pieces(faces))
+        return tuple(
+            jax.lax.bitcast_convert_type(word, dtype)
+            for word, (_, dtype) in zip(words, results, strict=True)
         )
-        return jax.pure_callback(host, shapes, _pieces(vertices), _pieces(faces))
 
     @bridge.def_vmap
     def batched(axis_size, in_batched, vertices, faces):
@@ -93,15 +99,25 @@ def _bridge(function: HostFunction, options: Hashable, results: tuple[ResultSpec
     return bridge
 
 
+def _words(shape: tuple[int, ...], dtype: str) -> jax.ShapeDtypeStruct:
+    if np.dtype(dtype).itemsize == 8:
+        return jax.ShapeDtypeStruct((*shape, 2), "uint32")
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
 def _pieces(array: Array) -> tuple[Array, ...]:
     flat = array.reshape(-1)
+    if flat.dtype.itemsize == 8:
+        flat = jax.lax.bitcast_convert_type(flat, "uint32").reshape(-1)
     step = _PIECE_BYTES // flat.dtype.itemsize
     return tuple(flat[start : start + step] for start in range(0, flat.size, step))
 
 
 @functools.cache
-def _host_entry(function, options, results, vertices_shape, faces_shape):
+def _host_entry(function, options, results, vertices_spec, faces_spec):
     """The callback itself, the same object for the same work so that XLA's caches are hit."""
+
+    num_meshes = vertices_spec[0][0]
 
     def run_on_host(vertex_pieces, face_pieces):
         with _traffic:
@@ -109,35 +125,43 @@ def _host_entry(function, options, results, vertices_shape, faces_shape):
 
     def measured(vertex_pieces, face_pieces):
         if _traffic.leaving:
-            num_meshes = vertices_shape[0]
-            return tuple(
-                np.full((num_meshes, *shape), np.nan if dtype.startswith("float") else 0, dtype)
-                for shape, dtype in results
-            )
-        vertices = _join(vertex_pieces, vertices_shape, np.float64)
-        faces = _join(face_pieces, faces_shape, np.int64)
-        faces = np.broadcast_to(faces, (len(vertices), *faces_shape[1:]))
+            nothing = [np.full((num_meshes, *shape), _nan_or_zero(d)) for shape, d in results]
+            return _as_words(nothing, results)
+        vertices = _join(vertex_pieces, *vertices_spec).astype(np.float64)
+        faces = _join(face_pieces, *faces_spec).astype(np.int64)
+        faces = np.broadcast_to(faces, (num_meshes, *faces.shape[1:]))
         meshes = list(zip(vertices, faces, strict=True))
-        if len(meshes) == 1:
+        if num_meshes == 1:
             found = [function(*meshes[0], options, parallel_map)]
         else:
             found = parallel_map(lambda mesh: function(*mesh, options, map), meshes)
-        return tuple(
-            np.stack([one[k] for one in found]).astype(dtype).reshape(len(meshes), *shape)
-            if meshes
-            else np.zeros((0, *shape), dtype)
-            for k, (shape, dtype) in enumerate(results)
-        )
+        stacked = [
+            np.array([one[k] for one in found]).reshape(num_meshes, *shape)
+            for k, (shape, _) in enumerate(results)
+        ]
+        return _as_words(stacked, results)
 
     return run_on_host
 
 
-def _join(pieces, shape: tuple[int, ...], dtype) -> np.ndarray:
+def _nan_or_zero(dtype: str) -> float:
+    return np.nan if np.issubdtype(dtype, np.floating) else 0
+
+
+def _as_words(arrays, results: tuple[ResultSpec, ...]) -> tuple[np.ndarray, ...]:
+    return tuple(
+        array.astype(dtype).reshape(-1).view(words.dtype).reshape(words.shape)
+        for array, (_, dtype) in zip(arrays, results, strict=True)
+        for words in [_words(array.shape, dtype)]
+    )
+
+
+def _join(pieces, shape: tuple[int, ...], dtype: str) -> np.ndarray:
     # jax.Array -> NumPy by np.asarray alone: any other use of jax here may wait for the thread
     # that waits for us.
     arrays = [np.asarray(piece) for piece in pieces]
-    joined = np.concatenate(arrays) if arrays else np.zeros(0)
-    return joined.astype(dtype).reshape(shape)
+    joined = np.concatenate(arrays) if arrays else np.zeros(0, dtype)
+    return joined.view(dtype).reshape(shape)
 
 
 def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
@@ -189,9 +213,10 @@ class _Traffic:
             self._last_end = time.monotonic()
 
     def is_quiet(self) -> bool:
-        # A solver asks again within milliseconds; a pause this long means that none is running.
+        # A solver asks again within milliseconds; a pause this long means that none is running,
+        # even where others keep the cores busy.
         with self._lock:
-            return self._under_way == 0 and time.monotonic() - self._last_end > 0.05
+            return self._under_way == 0 and time.monotonic() - self._last_end > 0.3
 
 
 _traffic = _Traffic()

@@ -41,8 +41,25 @@ def test_pieces_are_small_and_complete():
     array = jnp.arange(100_000, dtype="float32").reshape(-1, 2)
     pieces = host._pieces(array)
     assert len(pieces) == 5 and max(piece.nbytes for piece in pieces) <= 96 * 1024
-    np.testing.assert_array_equal(host._join(pieces, array.shape, np.float64), array)
-    assert host._join((), (0, 3), np.float64).shape == (0, 3)
+    np.testing.assert_array_equal(host._join(pieces, array.shape, "float32"), array)
+    assert host._join((), (0, 3), "float32").shape == (0, 3)
+
+
+def test_double_precision_in_a_context_reaches_the_host():
+    """The callback's thread does not see the caller's `enable_x64`."""
+    vertices, faces = join(sphere(), sphere(center=(1.1, 0.2, 0.1)))
+    with jax.enable_x64(True):
+        step = jax.jit(jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=32)))
+        exact = jnp.asarray(vertices * (1 + 1e-9))
+        results = [jax.block_until_ready(step(exact)) for _ in range(20)]
+        batch = jax.block_until_ready(jax.vmap(step)(exact[None]))
+    for value, gradient in results:
+        assert value.dtype == gradient.dtype == np.float64
+        assert float(value) == float(results[0][0])
+    assert float(batch[0][0]) == float(results[0][0])
+    with jax.enable_x64(True):
+        rounded = step(jnp.asarray(vertices))
+    assert 0 < abs(float(rounded[0]) / float(results[0][0]) - 1) < 1e-7  # not cut to float32
 
 
 def test_operands_stay_small_under_vmap():

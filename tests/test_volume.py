@@ -90,7 +90,7 @@ def test_order_of_convergence(name, rng):
     counts = [24, 48, 96, 192]
     errors = []
     for _ in range(8):
-        turned = moved(mesh, random_rotation(rng))
+        turned = moved(mesh, random_rotation(rng), rng.uniform(-1, 1, 3))
         errors.append([volumes(turned, n) / exact - 1 for n in counts])
     rms = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
     order = -np.polyfit(np.log(counts), np.log(rms), 1)[0]
@@ -188,7 +188,7 @@ def test_directions_agree_on_real_bodies():
     is held to it.
     """
     names = mocap().names
-    frames = np.random.default_rng(0).permutation(len(names))[:24]
+    frames = np.random.default_rng(0).permutation(len(names))[:14]
     worst = []
     for vertices in posed_bodies(frames):
         mesh = (vertices, body_faces())
@@ -197,7 +197,7 @@ def test_directions_agree_on_real_bodies():
         reference = volume(mesh, 2048)
         found = volumes(mesh)
         worst.append(max(np.abs(found / reference - 1).max(), np.ptp(found) / reference))
-    assert len(worst) >= 12
+    assert len(worst) >= 8
     assert np.median(worst) < 0.004
     assert np.mean(np.array(worst) < 0.01) >= 0.8
     assert max(worst) < 0.04
