@@ -9,6 +9,7 @@ from helpers import (
     body_faces,
     box,
     cast_rays,
+    inverted,
     join,
     moved,
     posed_bodies,
@@ -20,7 +21,7 @@ from helpers import (
 from spt_jax.rays import crossings as crossings_module
 from spt_jax.rays.beam import ScreenPoints, aim, orthogonal_directions, screen_frame
 from spt_jax.rays.crossings import cast
-from spt_jax.rays.levels import winding_numbers
+from spt_jax.rays.levels import find_overlaps, winding_numbers
 
 
 def signs_per_ray(found):
@@ -159,3 +160,24 @@ def test_meshes_without_extent_have_no_crossings():
     faces = np.array([[0, 1, 2], [0, 2, 1]])
     _, _, found = cast_rays((vertices, faces), (0, 0, -1), 64)
     assert len(found.ray) == 0 and found.open_rays == 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rays_left_out_of_the_sort_meet_no_overlap(seed):
+    """Random stacks of solids, inverted ones among them: what is kept gives the same overlaps."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for _ in range(rng.integers(1, 6)):
+        part = sphere(rng.uniform(0.2, 0.8), subdivisions=1)
+        part = moved(part, random_rotation(rng), rng.uniform(-0.8, 0.8, 3))
+        parts.append(inverted(part) if rng.random() < 0.3 else part)
+    vertices, faces = join(*parts)
+    for direction in rng.normal(size=(2, 3)):
+        beam, points = aim(vertices, direction, 40)
+        everything = find_overlaps(beam, points, faces, cast(beam, points, faces))
+        kept = cast(beam, points, faces, simple_rays=False)
+        assert len(kept.ray) < kept.met
+        found = find_overlaps(beam, points, faces, kept)
+        assert found.length == everything.length
+        np.testing.assert_array_equal(found.face, everything.face)
+        np.testing.assert_array_equal(found.class_sign, everything.class_sign)

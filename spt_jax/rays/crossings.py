@@ -56,8 +56,8 @@ def cast(
 ) -> Crossings:
     """The crossings of the beam's rays with the triangles, sorted along each ray.
 
-    Without `simple_rays`, rays that enter the mesh once and leave it once are left out: they meet
-    no overlap, and not sorting them halves the work on a body.
+    Without `simple_rays`, rays that are seen to meet no overlap before anything is sorted are left
+    out: those that enter and leave the mesh once or twice, in that order.
     """
     near = points.depth.min(initial=np.inf)
     thickness = points.depth.max(initial=-np.inf) - near
@@ -82,7 +82,7 @@ def cast(
     np.clip(depth, 0.0, steps, out=depth)
 
     open_rays, kept = _worth_sorting(
-        rows * columns, ray, depth, (1.0 - 2.0 * spans.leaves)[of_span], simple_rays
+        rows * columns, ray, depth, spans.leaves.astype(np.int64)[of_span], simple_rays
     )
     met = len(ray)
     if kept is not None:
@@ -111,25 +111,34 @@ def cast(
     return Crossings(ray, face, sign, 1.0 / per_unit if per_unit else 0.0, open_rays, met)
 
 
-def _worth_sorting(num_rays: int, ray, depth, sign, simple_rays: bool):
+def _worth_sorting(num_rays: int, ray, depth, leaves, simple_rays: bool):
     """The number of open rays, and which crossings to keep (None: all).
 
-    Decided from sums per ray, before the sort. Two crossings enclose one gap; the surface is the
-    right way out there if the entry lies in front, that is if the sum of sign * depth is not
-    positive.
+    Decided per ray from counts and from the first and last depth of entries and exits, before the
+    sort, which costs more than all of this.
     """
-    # A screen with far more rays than crossings is not worth an array of its size.
+    # A screen with far more rays than crossings is not worth arrays of its size.
     if num_rays > 8 * len(ray) + (1 << 20):
         used, ray = np.unique(ray, return_inverse=True)
         num_rays = len(used)
-    net = np.bincount(ray, sign, num_rays)
-    is_open = net != 0
+    entry_or_exit = 2 * ray + leaves
+    entries, exits = np.bincount(entry_or_exit, minlength=2 * num_rays).reshape(-1, 2).T
+    is_open = entries != exits
     open_rays = int(np.count_nonzero(is_open))
     if simple_rays:
         return open_rays, np.flatnonzero(~is_open[ray]) if open_rays else None
-    count = np.bincount(ray, minlength=num_rays)
-    inverted = np.bincount(ray, sign * depth, num_rays) > 0
-    return open_rays, np.flatnonzero((((count > 2) | inverted) & ~is_open)[ray])
+    first, last = np.full(2 * num_rays, np.inf), np.full(2 * num_rays, -np.inf)
+    np.minimum.at(first, entry_or_exit, depth)
+    np.maximum.at(last, entry_or_exit, depth)
+    (first_entry, first_exit), (last_entry, last_exit) = (
+        first.reshape(-1, 2).T,
+        last.reshape(-1, 2).T,
+    )
+    # Two passes overlap if both entries lie before both exits; a ray that starts with an exit or
+    # ends with an entry meets an inverted part; of three passes and more nothing is known yet.
+    kept = (entries > 2) | ((entries == 2) & (last_entry < first_exit))
+    kept |= (first_exit < first_entry) | (last_exit < last_entry)
+    return open_rays, np.flatnonzero((kept & ~is_open)[ray])
 
 
 @dataclass(frozen=True)
