@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Integer
 from spt_jax.rays.beam import Rays, orthogonal_directions
 from spt_jax.rays.measure import Directions
 
-# More rays than this along a side ask for more crossings than a machine can hold.
-_MOST_RAYS = 16384
+# A body at 4096 x 4096 rays takes 2 GB; four times that is more than most machines can spare.
+MOST_RAYS = 4096
 
 
 def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Integer[Array, "F 3"]]:
@@ -51,8 +51,6 @@ def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Inte
         )
     if not isinstance(faces, Tracer):
         check_indices(np.asarray(faces), shape[-2])
-    if np.issubdtype(given, np.unsignedinteger) or np.dtype(given).itemsize > 4:
-        faces = faces.astype(np.int32)
     return jnp.asarray(vertices), jnp.asarray(faces)
 
 
@@ -72,7 +70,7 @@ def as_rays(rays: Any) -> Rays:
     """A whole number of rays along the longer side, or (rows, columns).
 
     Raises:
-        TypeError, ValueError: anything else, or a number out of 1 to 16384.
+        TypeError, ValueError: anything else, or a number out of 1 to 4096.
     """
     if isinstance(rays, str) and rays == "auto":
         raise ValueError(
@@ -89,9 +87,9 @@ def _as_count(side: Any, rays: Any) -> int:
         raise TypeError(
             f"rays must be a whole number or (rows, columns): got {rays!r}; 512 is a good start."
         )
-    if side < 1 or side > _MOST_RAYS:
+    if side < 1 or side > MOST_RAYS:
         raise ValueError(
-            f"rays must be from 1 to {_MOST_RAYS} a side: got {rays!r}; 512 is a good start."
+            f"rays must be from 1 to {MOST_RAYS} a side: got {rays!r}; 512 is a good start."
         )
     return int(side)
 
@@ -145,7 +143,7 @@ def as_choice(name: str, value: Any, choices: Any) -> Any:
         ValueError: any other value.
     """
     allowed = get_args(choices)
-    if value not in allowed:
+    if not isinstance(value, str) or value not in allowed:
         listed = ", ".join(repr(choice) for choice in allowed)
         raise ValueError(f"{name} must be one of {listed}: got {value!r}.")
     return value

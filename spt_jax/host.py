@@ -62,7 +62,7 @@ def call_on_host(
     """
     batch = vertices.shape[:-2]
     bridge = _bridge(function, options, results)
-    flat = jax.lax.stop_gradient(vertices).reshape(-1, *vertices.shape[-2:])
+    flat = jax.lax.stop_gradient(vertices).reshape(math.prod(batch), *vertices.shape[-2:])
     found = bridge(flat, jax.lax.stop_gradient(faces)[None])
     return tuple(x.reshape(batch + x.shape[1:]) for x in found)
 
@@ -91,8 +91,8 @@ def _bridge(function: HostFunction, options: Hashable, results: tuple[ResultSpec
             if not faces_batched:
                 faces = faces[None]
             faces = jnp.broadcast_to(faces, (axis_size, num_meshes, *faces.shape[-2:]))
-            faces = faces.reshape(-1, *faces.shape[-2:])
-        found = bridge(vertices.reshape(-1, *vertices.shape[2:]), faces)
+            faces = faces.reshape(axis_size * num_meshes, *faces.shape[-2:])
+        found = bridge(vertices.reshape(axis_size * num_meshes, *vertices.shape[2:]), faces)
         found = tuple(x.reshape(axis_size, num_meshes, *x.shape[1:]) for x in found)
         return found, tuple(True for _ in found)
 
@@ -120,13 +120,16 @@ def _host_entry(function, options, results, vertices_spec, faces_spec):
     num_meshes = vertices_spec[0][0]
 
     def run_on_host(vertex_pieces, face_pieces):
-        with _traffic:
-            return measured(vertex_pieces, face_pieces)
-
-    def measured(vertex_pieces, face_pieces):
-        if _traffic.leaving:
+        with _traffic, np.errstate(all="ignore"):
+            try:
+                if not _traffic.leaving:
+                    return measured(vertex_pieces, face_pieces)
+            except MemoryError:
+                pass  # too many rays for this machine: as unusable as NaN vertices
             nothing = [np.full((num_meshes, *shape), _nan_or_zero(d)) for shape, d in results]
             return _as_words(nothing, results)
+
+    def measured(vertex_pieces, face_pieces):
         vertices = _join(vertex_pieces, *vertices_spec).astype(np.float64)
         faces = _join(face_pieces, *faces_spec).astype(np.int64)
         faces = np.broadcast_to(faces, (num_meshes, *faces.shape[1:]))
@@ -212,7 +215,13 @@ class _Traffic:
             self._under_way -= 1
             self._last_end = time.monotonic()
 
+    def has_been(self) -> bool:
+        """Whether any callback ever ran."""
+        with self._lock:
+            return self._under_way > 0 or self._last_end > -math.inf
+
     def is_quiet(self) -> bool:
+        """Whether none is running, nor likely to follow."""
         # A solver asks again within milliseconds; a pause this long means that none is running,
         # even where others keep the cores busy.
         with self._lock:
@@ -231,6 +240,8 @@ def _finish_pending_work() -> None:
     What is under way gets two seconds; then callbacks answer NaN at once, which ends a solver's
     loop or at least makes its steps cheap.
     """
+    if not _traffic.has_been():
+        return
     for leaving, seconds in ((False, 2.0), (True, 5.0)):
         _traffic.leaving = leaving
         deadline = time.monotonic() + seconds

@@ -202,9 +202,9 @@ def _value_of(vertices, faces, probes, options: _Options) -> np.ndarray:
 
 def _refuse_reserved(margin: Any, face_groups: Any, ignore_groups: Any, folds: Any) -> None:
     reserved = {
-        "margin": not (isinstance(margin, (int, float)) and margin == 0),
+        "margin": not (isinstance(margin, (int, float, np.number)) and margin == 0),
         "face_groups": face_groups is not None,
-        "ignore_groups": ignore_groups is not None and len(ignore_groups) > 0,
+        "ignore_groups": ignore_groups is not None and ignore_groups != (),
         "folds": folds is not None,
     }
     for name, used in reserved.items():

@@ -275,6 +275,7 @@ ERRORS = {
     ),
     "face negative": (_wrong_mesh(GOOD, FACES - 1), ValueError, "got index -1"),
     "no rays": (_wrong(rays=0), ValueError, "rays must be from 1 to .*got 0"),
+    "far too many rays": (_wrong(rays=5000), ValueError, "from 1 to 4096 a side: got 5000"),
     "negative rays": (_wrong(rays=(3, -4)), ValueError, r"got \(3, -4\)"),
     "fractional rays": (_wrong(rays=3.5), TypeError, "whole number"),
     "auto rays": (_wrong(rays="auto"), ValueError, "not in this version"),

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from spt_jax.arguments import as_directions, as_rays
+from spt_jax.arguments import MOST_RAYS, as_directions, as_rays
 from spt_jax.body import BodyModel
 from spt_jax.classes import classify_vertices
 from spt_jax.penalty import self_intersection_penalty
@@ -103,8 +104,10 @@ def untangle_pose(
 
     Raises:
         ValueError: pose of another shape than (..., J, 3) or with values that are not finite;
-            no weights, or weights that are not positive.
-        TypeError, ValueError: rays or directions as in `self_intersection_penalty`.
+            shape or translation that is not finite; no weights, or weights that are not positive
+            and finite; steps_per_weight not positive; more than 2048 rays, or fewer than one;
+            directions as in `self_intersection_penalty`.
+        TypeError: pose traced; rays or directions that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
 
@@ -122,19 +125,34 @@ def untangle_pose(
             f"pose must have shape (..., {body.num_joints}, 3): got {pose.shape}; "
             "body.pose_from_smpl converts poses of other joint counts."
         )
+    if isinstance(pose, Tracer):
+        raise TypeError(
+            "pose must be known: got a traced array; untangle_pose decides by the values that it "
+            "sees, so call it outside jit, vmap and grad."
+        )
     if not np.isfinite(pose).all():
         raise ValueError(
             f"pose must be finite: got {int(np.sum(~np.isfinite(pose)))} values that are not; "
             "leave such frames out."
         )
-    if not weights or not all(weight > 0 for weight in weights):
-        raise ValueError(f"weights must be positive, at least one: got {weights!r}.")
-    if isinstance(as_rays(rays), tuple):
-        raise TypeError(f"rays must be a whole number: got {rays!r}.")
-    search = _Search(
-        int(rays), as_directions(directions), solver or optx.BFGS(rtol=1e-3, atol=1e-3)
-    )
+    weights = tuple(float(weight) for weight in np.atleast_1d(np.asarray(weights, np.float64)))
+    if not weights or not all(0 < weight < np.inf for weight in weights):
+        raise ValueError(f"weights must be positive and finite, at least one: got {weights!r}.")
+    if not isinstance(steps_per_weight, (int, np.integer)) or steps_per_weight < 1:
+        raise ValueError(
+            f"steps_per_weight must be a positive whole number: got {steps_per_weight!r}."
+        )
+    rays = as_rays(rays)
+    if isinstance(rays, tuple) or 2 * rays > MOST_RAYS:
+        raise ValueError(
+            f"rays must be a whole number up to {MOST_RAYS // 2}, half of what is measured with: "
+            f"got {rays!r}."
+        )
     batch = pose.shape[:-2]
+    for name, array in (("shape", shape), ("translation", translation)):
+        if array is not None and not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite: got {np.asarray(array)!r}.")
+    search = _Search(rays, as_directions(directions), solver or optx.BFGS(rtol=1e-3, atol=1e-3))
     poses = pose.reshape(-1, *pose.shape[-2:])
     shapes = _per_pose(shape, batch, len(poses))
     translations = _per_pose(translation, batch, len(poses))

@@ -19,6 +19,11 @@ _LADDER_STEPS = 8
 _TURN = np.arctan((np.sqrt(5.0) - 1.0) / 2.0)
 
 
+# No ray goes through the world's origin or along its axes: that is where modelled objects have
+# their vertices and faces, and a face seen exactly edge-on is seen by luck alone.
+_SHIFT = np.array([0.3819660112501051, 0.2763932022500210])
+
+
 @dataclass(frozen=True)
 class Beam:
     """Parallel rays through the integer points of a lattice fixed in the world.
@@ -31,7 +36,7 @@ class Beam:
         frame: rows u, v, d: the screen's axes and the direction of the rays, with u x v = -d, so
             that a triangle which faces the rays is counter-clockwise on the screen.
         pixel: width and height of a pixel, in the mesh's unit.
-        origin: the lattice index (column, row) of the screen's first ray.
+        origin: where the screen's first ray is, (column, row) in pixels from the world's origin.
         shape: rows and columns of the screen.
     """
 
@@ -101,7 +106,7 @@ def aim(
     column, row, depth = frame @ vertices.T
     column /= pixel[0]
     row /= pixel[1]
-    origin = np.floor([column.min(), row.min()])
+    origin = np.floor([column.min(), row.min()] + _SHIFT) - _SHIFT
     column -= origin[0]
     row -= origin[1]
     shape = (int(row.max()) + 2, int(column.max()) + 2)

@@ -1,4 +1,4 @@
-"""The gradient of the overlap volume, as one vector per vertex (DESIGN of the method below).
+"""The gradient of the overlap volume, as one vector per vertex.
 
 Moving the surface with velocity v changes the overlap volume by the integral of c (v . n) over
 the surface, c = sign(w_out) being the class of Algorithm 1. With linear triangles the gradient at
@@ -38,6 +38,9 @@ def boundary_gradient(
     """
     corners = faces[overlaps.face]
     normal = area_normals(vertices, corners)
+    # The weight does not depend on the normal's length; squares of tiny or huge ones would.
+    longest = np.abs(normal).max(axis=1, initial=0.0)
+    normal = normal / np.where(longest > 0, longest, 1.0)[:, None]
     cosines = normal @ directions.T
     seen = np.einsum("kd,kd->k", cosines, cosines)
     # area * (n.d)^2 / sum (n.d')^2 * n, with lengths of normals cancelling: no root, no division

@@ -9,10 +9,14 @@ surface is inside out.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from spt_jax.rays.beam import Beam, ScreenPoints
 from spt_jax.rays.crossings import Crossings
+
+# A triangle seen edge-on is a line on the screen. Narrower than this, in pixels, rounding decides
+# which rays hit it and at which of its depths, and nothing on such a ray can be told.
+_NARROWEST = 1e-5
 
 # Overlaps thinner than this part of the mesh's depth are no overlaps: where a ray grazes a
 # silhouette, the order of two crossings at one depth is a matter of rounding.
@@ -58,6 +62,10 @@ def find_overlaps(
     """
     winding = winding_numbers(crossings)
     gap = np.flatnonzero(winding >> 1)  # all but 0 and 1
+    if len(gap):
+        hit_edge_on = _edge_on(points, faces)[crossings.face]
+        if hit_edge_on.any():
+            gap = gap[~np.isin(crossings.ray[gap], crossings.ray[hit_edge_on])]
     weight = np.maximum(winding[gap] - 1, -winding[gap])
 
     # Adjacent overlapped gaps form a run; crossings gap and gap + 1 bound each gap.
@@ -73,7 +81,8 @@ def find_overlaps(
 
     length = depth[start + 1] - depth[start]
     thinnest = max(2 * crossings.depth_quantum, _THINNEST * np.ptp(points.depth))
-    weight = weight * (np.bincount(run, length)[run] > thinnest) if len(gap) else weight
+    if len(gap):
+        weight = weight * (np.bincount(run, weight * length)[run] > thinnest)
     # d(overlap)/d(depth): the gap in front of a crossing grows, the one behind it shrinks.
     by_depth = np.bincount(start + 1, weight, len(crossing)) - np.bincount(
         start, weight, len(crossing)
@@ -81,6 +90,16 @@ def find_overlaps(
     sign = crossings.sign[crossing]
     class_sign = (-sign * by_depth).astype(np.int64)
     return Overlaps(face, ray, sign, barycentric, depth, class_sign, float(weight @ length))
+
+
+def _edge_on(
+    points: ScreenPoints, faces: Int[np.ndarray, "F 3"]
+) -> Bool[np.ndarray, "F"]:
+    x0, x1, x2 = points.column[faces.T]
+    y0, y1, y2 = points.row[faces.T]
+    twice_area = np.abs((x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0))
+    size = np.abs(x1 - x0) + np.abs(y1 - y0) + np.abs(x2 - x0) + np.abs(y2 - y0)
+    return twice_area <= _NARROWEST * size
 
 
 def _barycentric(
