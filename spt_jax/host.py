@@ -54,7 +54,8 @@ def call_on_host(
         function: a module-level function; its identity is part of the cache key, so a lambda made
             anew for each call would be traced anew for each call.
         options: handed on as they are.
-        results: for each result, its shape for one mesh and its dtype.
+        results: for each result, its shape for one mesh and its dtype. Where nothing can be
+            measured, numbers come back as NaN and arrays as zeros.
         vertices: any number of leading batch axes.
         faces: shared by the batch; under `vmap` they may be batched too.
 
@@ -126,7 +127,9 @@ def _host_entry(function, options, results, vertices_spec, faces_spec):
                     return measured(vertex_pieces, face_pieces)
             except MemoryError:
                 pass  # too many rays for this machine: as unusable as NaN vertices
-            nothing = [np.full((num_meshes, *shape), _nan_or_zero(d)) for shape, d in results]
+            nothing = [
+                np.full((num_meshes, *shape), 0.0 if shape else np.nan) for shape, _ in results
+            ]
             return _as_words(nothing, results)
 
     def measured(vertex_pieces, face_pieces):
@@ -147,10 +150,6 @@ def _host_entry(function, options, results, vertices_spec, faces_spec):
     return run_on_host
 
 
-def _nan_or_zero(dtype: str) -> float:
-    return np.nan if np.issubdtype(dtype, np.floating) else 0
-
-
 def _as_words(arrays, results: tuple[ResultSpec, ...]) -> tuple[np.ndarray, ...]:
     return tuple(
         array.astype(dtype).reshape(-1).view(words.dtype).reshape(words.shape)
@@ -169,14 +168,20 @@ def _join(pieces, shape: tuple[int, ...], dtype: str) -> np.ndarray:
 
 def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
     """Like map, on the process's own threads; NumPy releases the lock in sorts and large loops."""
+
+    # NumPy's error state belongs to a thread; overflow here is the caller's to see in the result.
+    def quietly(item):
+        with np.errstate(all="ignore"):
+            return function(item)
+
     items = list(items)
     if len(items) < 2 or _usable_cores() < 2:
-        return [function(item) for item in items]
+        return [quietly(item) for item in items]
     try:
-        futures = [_executor().submit(function, item) for item in items]
+        futures = [_executor().submit(quietly, item) for item in items]
     except RuntimeError:
         # The interpreter is shutting down and takes no new work from pools.
-        return [function(item) for item in items]
+        return [quietly(item) for item in items]
     return [future.result() for future in futures]
 
 

@@ -66,7 +66,8 @@ def self_intersection_penalty(
 
     Differentiation: reverse mode (`jax.grad`, `jax.vjp`, `jac="bwd"` in optimistix) with respect to
         vertices. The gradient is computed with the value and held fixed: in second derivatives
-        the penalty counts as linear. There is no forward mode.
+        the penalty counts as linear. There is no forward mode. Inside `jax.shard_map` pass it
+        check_vma=False.
 
     Example:
         >>> import jax, trimesh
@@ -173,24 +174,26 @@ def _scalar(vertices):
 
 
 def _value_on_host(vertices, faces, options: _Options, map_directions: Map):
-    if not measure.usable(vertices, faces):
-        return (np.array(np.nan),)
-    if faces.size == 0:
-        return (np.zeros(()),)
-    probes = measure.probe(vertices, faces, options.sampling, map_directions)
-    return (_value_of(vertices, faces, probes, options),)
+    return _measure(vertices, faces, options, map_directions, with_gradient=False)[:1]
 
 
 def _value_and_gradient_on_host(vertices, faces, options: _Options, map_directions: Map):
+    return _measure(vertices, faces, options, map_directions, with_gradient=True)
+
+
+def _measure(vertices, faces, options: _Options, map_directions: Map, *, with_gradient: bool):
+    gradient = np.zeros_like(vertices)
     if not measure.usable(vertices, faces):
-        return np.array(np.nan), np.zeros_like(vertices)
+        return np.array(np.nan), gradient
     if faces.size == 0:
-        return np.zeros(()), np.zeros_like(vertices)
+        return np.zeros(()), gradient
     probes = measure.probe(vertices, faces, options.sampling, map_directions)
-    return (
-        _value_of(vertices, faces, probes, options),
-        measure.gradient(vertices, faces, probes, options.gradient),
-    )
+    value = _value_of(vertices, faces, probes, options)
+    if with_gradient:
+        gradient = measure.gradient(vertices, faces, probes, options.gradient)
+    if not (np.isfinite(value) and np.isfinite(gradient).all()):  # coordinates near overflow
+        return np.array(np.nan), np.zeros_like(vertices)
+    return value, gradient
 
 
 def _value_of(vertices, faces, probes, options: _Options) -> np.ndarray:

@@ -3,7 +3,12 @@
 import jax
 import numpy as np
 import pytest
+from hypothesis import settings
 from jaxtyping import config, install_import_hook
+
+# The same examples on every machine, and no database of them in the tree.
+settings.register_profile("suite", derandomize=True, database=None)
+settings.load_profile("suite")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import join, sphere
 
-from spt_jax import host, self_intersection_penalty
+from spt_jax import host, penalty, self_intersection_penalty
 
 SCRIPTS = Path(__file__).parent / "scripts"
 
@@ -22,12 +22,13 @@ def run(*arguments, timeout):
     )
 
 
-def test_no_deadlock():
+@pytest.mark.parametrize("cores", [1, 2])
+def test_no_deadlock(cores):
     """https://github.com/jax-ml/jax/issues/24255, https://github.com/jax-ml/jax/issues/25861.
 
     With whole arrays instead of pieces the program hangs at 147 kB.
     """
-    done = run(SCRIPTS / "no_deadlock.py", timeout=200)
+    done = run(SCRIPTS / "no_deadlock.py", cores, timeout=200)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("finished") == 2
 
@@ -83,6 +84,39 @@ def _callback_operand_bytes(jaxpr):
             if hasattr(inner, "eqns"):
                 sizes += _callback_operand_bytes(inner)
     return sizes
+
+
+def test_shard_map():
+    vertices, faces = join(sphere(subdivisions=2), sphere(center=(1.1, 0.2, 0.1), subdivisions=2))
+    batch = jnp.stack([jnp.asarray(vertices * s, "float32") for s in (1.0, 1.1)])
+
+    def total(v):
+        return self_intersection_penalty(v, faces, rays=32)
+
+    devices = jax.make_mesh((1,), ("d",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec = jax.sharding.PartitionSpec("d")
+    # The type of a callback's result does not say that it differs by device.
+    sharded = jax.shard_map(total, mesh=devices, in_specs=spec, out_specs=spec, check_vma=False)
+    np.testing.assert_allclose(sharded(batch), total(batch))
+    gradient = jax.jit(jax.grad(lambda v: sharded(v).sum()))(batch)
+    np.testing.assert_allclose(gradient, jax.grad(lambda v: total(v).sum())(batch))
+
+
+def test_too_little_memory_is_nan_and_no_crash(monkeypatch):
+    def hungry(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(penalty.measure, "probe", hungry)
+    vertices, faces = join(sphere(subdivisions=1), sphere(subdivisions=1))
+    step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=31))
+    value, gradient = step(jnp.asarray(vertices, "float32"))
+    assert np.isnan(value) and np.abs(gradient).max() == 0
+
+
+def test_an_import_alone_leaves_quietly():
+    code = "import os; os.environ['JAX_PLATFORMS'] = 'nowhere'; import spt_jax; print('end')"
+    done = run("-c", code, timeout=100)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "end", "")
 
 
 def test_threads_do_not_change_the_result(monkeypatch):

@@ -1,13 +1,31 @@
 """The penalty as a JAX function: values, derivatives, transformations and wrong input."""
 
+import ipctk
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box, inverted, join, lens_volume, moved, random_rotation, sphere
+import trimesh
+from helpers import (
+    body_faces,
+    box,
+    embedded_body,
+    inverted,
+    join,
+    lens_volume,
+    mocap,
+    moved,
+    posed_bodies,
+    random_rotation,
+    sampling,
+    sphere,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from spt_jax import classify_vertices, paper_penalty, self_intersection_penalty
+from spt_jax import classify_vertices, host, paper_penalty, penalty, self_intersection_penalty
+from spt_jax.rays import measure
 
 PAIR = join(sphere(subdivisions=2), sphere(center=(1.2, 0.1, 0.05), subdivisions=2))
 FACES = PAIR[1].astype(np.int32)
@@ -53,6 +71,25 @@ def test_gradient_is_the_derivative_of_the_value(x64):
         return self_intersection_penalty(moved_part, FACES, rays=64, directions=1)
 
     check_grads(shifted, (0.0,), order=1, modes=["rev"], eps=1e-7, rtol=1e-3)
+
+
+def test_gradient_on_the_body_is_the_derivative_of_the_value(x64):
+    """Through JAX, from the pose: central differences of the value on the lattice, 1e-3."""
+    body = embedded_body()
+    names = list(mocap().names)
+    pose = body.pose_from_smpl(jnp.asarray(mocap().pose[names.index("roll/0056")], "float64"))
+    rng = np.random.default_rng(4)
+
+    @jax.jit
+    def along(t, change):
+        vertices = body(pose.at[1:22].add(t * change)).vertices
+        return self_intersection_penalty(vertices, body.faces, rays=200, directions=1)
+
+    for _ in range(5):
+        change = jnp.asarray(rng.normal(size=(21, 3)))
+        exact = jax.grad(along)(0.0, change)
+        numeric = (along(1e-7, change) - along(-1e-7, change)) / 2e-7
+        assert float(numeric) == pytest.approx(float(exact), rel=1e-3)
 
 
 @pytest.mark.parametrize("value", ["volume", "ratio"])
@@ -191,15 +228,16 @@ def test_repeated_calls_are_traced_once():
     for k in range(5):
         step(vertices + 0.01 * k)
     assert traces == 1
-    # Outside jit the penalty brings its own cache.
+    # Outside jit the penalty brings its own cache: nothing is traced again for the host either.
+    caches = (host._bridge, host._host_entry)
+    jax.value_and_grad(loss)(vertices)
     loss(vertices)
-    with jax.log_compiles(False):
-        from spt_jax.penalty import _penalty
-
-        before = _penalty._cache_size()
-        for k in range(5):
-            loss(vertices + 0.01 * k)
-        assert _penalty._cache_size() == before
+    before = penalty._penalty._cache_size(), [cache.cache_info().misses for cache in caches]
+    for k in range(5):
+        loss(vertices + 0.01 * k)
+        jax.value_and_grad(loss)(vertices + 0.01 * k)
+    after = penalty._penalty._cache_size(), [cache.cache_info().misses for cache in caches]
+    assert after == before
 
 
 def test_second_derivatives_take_the_penalty_as_linear(dtype):
@@ -244,7 +282,76 @@ def test_traced_faces_out_of_range_give_nan():
     assert np.isnan(value) and np.abs(gradient).max() == 0
 
 
+def test_faces_seen_edge_on_make_no_overlap(dtype):
+    """Solids with walls along the rays, where rounding decides which rays hit them."""
+    cylinder = trimesh.creation.cylinder(0.5, 1.0)
+    cone = trimesh.creation.cone(0.5, 1.0)
+    for k in range(8):
+        turn = trimesh.transformations.rotation_matrix(k * np.pi / 4, [1, k % 3, 0])[:3, :3]
+        for solid in (cylinder, cone, trimesh.creation.box()):
+            for shift in ((0, 0, 0), (0, 0, 0.5)):
+                mesh = moved((np.array(solid.vertices), np.array(solid.faces)), turn, shift)
+                for rays in (16, 100, (64, 64)):
+                    value = self_intersection_penalty(as_jax(mesh, dtype), mesh[1], rays=rays)
+                    assert value == 0.0
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from([box(), sphere(subdivisions=2), box((1, 2, 0.5))]),
+    st.sampled_from([(8, 8), (64, 64), (32, 64), 16, 64, 7]),
+    st.sampled_from([0.0, 1e-16, 1e-15, 1e-13, 1e-11, 1e-8]),
+    st.sampled_from([0.001, 0.5, 1.0, 10.0]),
+    st.sampled_from([1, 3]),
+    st.integers(0, 2**32 - 1),
+)
+def test_convex_solids_never_overlap(mesh, rays, noise, scale, directions, seed):
+    rng = np.random.default_rng(seed)
+    corner = rng.choice(mesh[0])
+    vertices = (mesh[0] - corner * rng.integers(0, 2)) * scale
+    vertices = vertices + noise * rng.normal(size=vertices.shape)
+    probes = measure.probe(vertices, mesh[1], sampling(rays, directions))
+    assert measure.volume(probes) == 0
+    assert not measure.labels(mesh[1], len(vertices), probes).any()
+
+
+def test_bodies_that_ipctk_calls_free_are_exactly_free():
+    """No self-intersection of the mesh by ipctk, an exact test: value and gradient are zero."""
+    faces = body_faces().astype(np.int32)
+    edges = ipctk.edges(faces)
+    for vertices in posed_bodies(
+        ["cartwheel/0034", "dance_a/0017", "dance_a/0035", "dance_a/0044"]
+    ):
+        mesh = ipctk.CollisionMesh(vertices, edges, faces)
+        assert not ipctk.has_intersections(mesh, vertices)
+        for rays in (512, (300, 300)):
+            value, gradient = jax.value_and_grad(
+                lambda v: self_intersection_penalty(v, faces, rays=rays)  # noqa: B023
+            )(jnp.asarray(vertices, "float32"))
+            assert value == 0.0 and np.abs(gradient).max() == 0.0
+
+
+def test_extreme_scales(x64):
+    vertices = jnp.asarray(moved(PAIR, random_rotation(np.random.default_rng(2)))[0])
+    value, gradient = jax.value_and_grad(loss)(vertices)
+    for exponent in (-300, -200, 200, 300):  # powers of two keep the lattice's pixels
+        scale = 2.0**exponent
+        scaled_value, scaled_gradient = jax.value_and_grad(loss)(vertices * scale)
+        assert float(scaled_value / scale / scale / scale) == pytest.approx(float(value))
+        np.testing.assert_allclose(scaled_gradient / scale / scale, gradient, atol=1e-12)
+
+
+def test_overflow_is_nan_and_no_crash(dtype):
+    huge = as_jax(PAIR, dtype) * np.asarray(1e30 if dtype == np.float32 else 1e307, dtype)
+    value, gradient = jax.value_and_grad(loss)(huge)
+    assert not value < np.inf  # too large for the dtype
+    assert not np.isnan(gradient).any()
+
+
 def test_meshes_without_triangles_or_extent_are_free():
+    none = np.zeros((0, 3), np.int32)
+    assert loss(jnp.zeros((0, 3)), none) == 0
+    assert jax.vmap(lambda v: loss(v, none))(jnp.zeros((2, 0, 3))).shape == (2,)
     empty = np.zeros((0, 3), np.int32)
     assert loss(jnp.zeros((4, 3)), empty) == 0
     value, gradient = jax.value_and_grad(loss)(jnp.full((4, 3), 0.7), np.array([[0, 1, 2]]))

@@ -28,6 +28,10 @@ def test_the_commands_are_marked_once():
         assert command.startswith("python3 -m venv .venv && ")
 
 
+def test_nothing_was_left_open():
+    assert "@@" not in README and "TODO" not in README
+
+
 def test_pictures_and_pages_exist():
     for target in re.findall(r"\]\((?!https?:)([^)]+)\)", README):
         assert (Path(__file__).parents[1] / target).is_file(), target

@@ -113,7 +113,7 @@ def test_two_bodies_against_boolean_volume():
     first = (body, body_faces())
     second = moved(first, translation=(0.12, 0.03, 0.05))
     expected = boolean_overlap(first, second)
-    assert volume(first) < 1e-8
+    assert volume(first) == 0
     np.testing.assert_allclose(volumes(join(first, second)), expected, rtol=5e-3)
 
 
@@ -184,20 +184,22 @@ def test_simple_solids_have_exactly_none(rng):
 def test_directions_agree_on_real_bodies():
     """At 512 x 512 the three directions against each other and against 2048 x 2048.
 
-    benchmarks/quadrature.py prints the whole distribution over 50 frames; here a sample of them
-    is held to it.
+    Within 1 % where more than 100 cm^3 overlap; smaller overlaps, a few rays wide, scatter up to
+    4 %. benchmarks/quadrature.py prints the whole distribution over 50 frames.
     """
     names = mocap().names
     frames = np.random.default_rng(0).permutation(len(names))[:14]
-    worst = []
+    worst, sizes = [], []
     for vertices in posed_bodies(frames):
         mesh = (vertices, body_faces())
         if volume(mesh, 256) < 1e-5:
             continue
         reference = volume(mesh, 2048)
         found = volumes(mesh)
+        sizes.append(reference)
         worst.append(max(np.abs(found / reference - 1).max(), np.ptp(found) / reference))
     assert len(worst) >= 8
-    assert np.median(worst) < 0.004
-    assert np.mean(np.array(worst) < 0.01) >= 0.8
+    worst, large = np.array(worst), np.array(sizes) > 1e-4
+    assert large.sum() >= 4 and worst[large].max() < 0.01
+    assert np.median(worst) < 0.01
     assert max(worst) < 0.04

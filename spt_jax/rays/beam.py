@@ -106,7 +106,8 @@ def aim(
     column, row, depth = frame @ vertices.T
     column /= pixel[0]
     row /= pixel[1]
-    origin = np.floor([column.min(), row.min()] + _SHIFT) - _SHIFT
+    lowest = np.array([column.min(), row.min()])
+    origin = np.floor(lowest + _SHIFT) - _SHIFT
     column -= origin[0]
     row -= origin[1]
     shape = (int(row.max()) + 2, int(column.max()) + 2)

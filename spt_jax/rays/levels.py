@@ -92,9 +92,7 @@ def find_overlaps(
     return Overlaps(face, ray, sign, barycentric, depth, class_sign, float(weight @ length))
 
 
-def _edge_on(
-    points: ScreenPoints, faces: Int[np.ndarray, "F 3"]
-) -> Bool[np.ndarray, "F"]:
+def _edge_on(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:
     x0, x1, x2 = points.column[faces.T]
     y0, y1, y2 = points.row[faces.T]
     twice_area = np.abs((x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0))
