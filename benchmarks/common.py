@@ -12,7 +12,7 @@ import rich.table
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from spt_jax.files import atomic_write
+from spt_jax.output_files import atomic_write
 
 RESULTS = Path(__file__).with_name("results.md")
 FIGURES = Path(__file__).with_name("figures")

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from spt_jax.files import atomic_write
+from spt_jax.output_files import atomic_write
 
 BODY_COLOUR = (213, 201, 188)
 OUT_COLOUR = (222, 58, 24)

@@ -50,7 +50,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
     """
     if not 1 <= frames <= len(DEMO_FRAMES):
         raise CommandError(f"frames must be from 1 to {len(DEMO_FRAMES)}: got {frames}.")
-    from spt_jax.files import ensure_folder, write_json
+    from spt_jax.output_files import ensure_folder, write_json
 
     with user_errors():
         folder = ensure_folder(out)
@@ -102,7 +102,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
 
 def _draw(path: Path, frames: list["Frame"], faces: Any) -> str | None:
     """Draw the picture, or say why there is none."""
-    from spt_jax.files import atomic_write
+    from spt_jax.output_files import atomic_write
     from spt_jax.show import RenderingUnavailable, render_strip
 
     # Two blocks of rows side by side: one above the other is too tall for a page or a screen.

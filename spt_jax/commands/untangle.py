@@ -44,8 +44,8 @@ def untangle(
         quiet: print errors alone.
     """
     from spt_jax.arguments import as_rays
-    from spt_jax.files import ensure_folder, write_json
     from spt_jax.fit.pose_files import read_poses
+    from spt_jax.output_files import ensure_folder, write_json
 
     with user_errors():
         as_rays(rays)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from spt_jax.files import atomic_write
+from spt_jax.output_files import atomic_write
 
 JOINT_COUNTS = (22, 24, 52, 55)
 """Body alone; SMPL; SMPL-H, with fingers; SMPL-X, with jaw and eyes before the fingers."""

@@ -8,8 +8,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int, UInt8
 
-from spt_jax.files import atomic_write
 from spt_jax.mesh_files import as_mesh_arrays
+from spt_jax.output_files import atomic_write
 from spt_jax.show.framing import View, frame
 from spt_jax.show.offscreen import import_extra
 from spt_jax.show.panel import draw_panel, panel_plotter

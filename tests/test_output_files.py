@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from spt_jax.files import atomic_write, ensure_folder, write_json
 from spt_jax.mesh_files import (
     BODY_COLOUR,
     IN_COLOUR,
@@ -15,6 +14,7 @@ from spt_jax.mesh_files import (
     read_mesh,
     write_mesh,
 )
+from spt_jax.output_files import atomic_write, ensure_folder, write_json
 
 
 def cube():
