@@ -116,6 +116,12 @@ def test_never_worse_than_the_start():
         (np.zeros((52, 3), "float32"), {"rays": 0}, "rays must be from 1"),
         (np.zeros((52, 3), "float32"), {"rays": 4000}, "up to 2048"),
         (np.zeros((52, 3), "float32"), {"steps_per_weight": 0}, "steps_per_weight must be"),
+        (
+            np.zeros((52, 3), "float32"),
+            {"translation": np.zeros((2, 3))},
+            "translation must be one",
+        ),
+        (np.zeros((52, 3), "float32"), {"translation": np.float32(0)}, "translation must be one"),
         (np.zeros((52, 3), "float32"), {"shape": np.array([np.nan])}, "shape must be finite"),
     ],
 )

@@ -104,9 +104,9 @@ def untangle_pose(
 
     Raises:
         ValueError: pose of another shape than (..., J, 3) or with values that are not finite;
-            shape or translation that is not finite; no weights, or weights that are not positive
-            and finite; steps_per_weight not positive; more than 2048 rays, or fewer than one;
-            directions as in `self_intersection_penalty`.
+            shape or translation that is not finite or does not fit pose's batch axes; no weights,
+            or weights that are not positive and finite; steps_per_weight not positive; more than
+            2048 rays, or fewer than one; directions as in `self_intersection_penalty`.
         TypeError: pose traced; rays or directions that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
@@ -142,8 +142,8 @@ def untangle_pose(
         raise ValueError(
             f"steps_per_weight must be a positive whole number: got {steps_per_weight!r}."
         )
-    rays = as_rays(rays)
-    if isinstance(rays, tuple) or 2 * rays > MOST_RAYS:
+    search_rays = as_rays(rays)
+    if isinstance(search_rays, tuple) or 2 * search_rays > MOST_RAYS:
         raise ValueError(
             f"rays must be a whole number up to {MOST_RAYS // 2}, half of what is measured with: "
             f"got {rays!r}."
@@ -152,10 +152,12 @@ def untangle_pose(
     for name, array in (("shape", shape), ("translation", translation)):
         if array is not None and not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite: got {np.asarray(array)!r}.")
-    search = _Search(rays, as_directions(directions), solver or optx.BFGS(rtol=1e-3, atol=1e-3))
+    search = _Search(
+        search_rays, as_directions(directions), solver or optx.BFGS(rtol=1e-3, atol=1e-3)
+    )
     poses = pose.reshape(-1, *pose.shape[-2:])
-    shapes = _per_pose(shape, batch, len(poses))
-    translations = _per_pose(translation, batch, len(poses))
+    shapes = _per_pose("shape", shape, batch, len(poses))
+    translations = _per_pose("translation", translation, batch, len(poses))
     found = [
         _untangle_one(search, body, *one, weights, steps_per_weight, tolerance, on_step or _nothing)
         for one in zip(poses, shapes, translations, strict=True)
@@ -249,11 +251,18 @@ def _descend(search, body, fixed, moved, weight, max_steps):
     return solution.value, solution.stats["num_steps"]
 
 
-def _per_pose(array, batch, count):
+def _per_pose(name, array, batch, count):
     if array is None:
         return [None] * count
     array = jnp.asarray(array)
-    return list(jnp.broadcast_to(array, (*batch, array.shape[-1])).reshape(count, -1))
+    try:
+        spread = jnp.broadcast_to(array, (*batch, array.shape[-1]))
+    except (IndexError, ValueError):
+        raise ValueError(
+            f"{name} must be one vector, or have pose's batch axes {batch} in front: got shape "
+            f"{array.shape}."
+        ) from None
+    return list(spread.reshape(count, array.shape[-1]))
 
 
 def _nothing(stage: int, steps: int, volume: float) -> None:
