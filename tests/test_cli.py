@@ -1,3 +1,5 @@
+"""`spt-jax demo` and `spt-jax untangle`, in this process and in one of their own."""
+
 import json
 import os
 import signal
@@ -9,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers import box, inverted, join
 from helpers_body import synthetic_smpl
 
 from spt_jax.body import load_mocap
@@ -44,11 +45,6 @@ def files_in(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def write(path, mesh):
-    trimesh.Trimesh(*mesh, process=False).export(path)
-    return str(path)
-
-
 def mocap_file(path, names):
     mocap = load_mocap()
     pose = mocap.pose[[mocap.names.index(name) for name in names]]
@@ -70,74 +66,6 @@ def test_an_unknown_command_exits_with_2(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["tangle"])
     assert stop.value.code == 2
-
-
-def test_check_of_a_clean_mesh(tmp_path, capsys):
-    assert main(["check", write(tmp_path / "a.ply", box()), "--rays", "64"]) == 0
-    assert "no ray sees a self-intersection" in capsys.readouterr().out
-
-
-def test_check_of_a_mesh_that_intersects_itself(tmp_path, capsys):
-    mesh = write(tmp_path / "a.stl", join(box(), box(center=(0.53, 0.1, 0.2))))
-    assert main(["check", mesh, "--rays", "64"]) == 1
-    text = capsys.readouterr().out
-    assert "it self-intersects" in text and "overlap volume" in text
-
-
-@pytest.mark.parametrize(
-    ("mesh", "seen"),
-    [
-        ((box()[0], box()[1][1:]), "3 boundary edges around 1 hole"),
-        (inverted(box()), "1 inverted component of 1"),
-        ((box()[0], np.concatenate([box()[1][1:], box()[1][:1, ::-1]])), "3 edges that both"),
-    ],
-)
-def test_check_of_a_mesh_that_cannot_be_judged(mesh, seen, tmp_path, capsys):
-    assert main(["check", write(tmp_path / "a.ply", mesh)]) == 2
-    text = capsys.readouterr().out
-    assert seen in text and "overlap volume" not in text
-
-
-def test_check_of_what_is_no_mesh(tmp_path, capsys):
-    (tmp_path / "a.ply").write_text("ply\nnonsense")
-    for name in ("a.ply", "missing.ply", "a.xyz2"):
-        assert main(["check", str(tmp_path / name)]) == 2
-        captured = capsys.readouterr()
-        assert captured.out == "" and captured.err.startswith("spt-jax: mesh file must ")
-        assert captured.err.count("\n") == 1
-    assert main(["check", write(tmp_path / "b.ply", box()), "--rays", "0"]) == 2
-    assert "rays must be from 1 to 16384 a side: got 0" in capsys.readouterr().err
-
-
-def test_check_as_json(tmp_path, capsys):
-    def checked(path, code):
-        assert main(["check", str(path), "--json", "--rays", "32"]) == code
-        captured = capsys.readouterr()
-        found = json.loads(captured.out)
-        assert captured.err == "" and found["exit_code"] == code
-        return found
-
-    clean = checked(write(tmp_path / "a.ply", box()), 0)
-    assert clean["mesh"]["components"] == 1 and clean["intersection"]["volume"] == 0
-    pair = checked(write(tmp_path / "b.ply", join(box(), box(center=(0.5, 0, 0)))), 1)
-    assert pair["intersection"]["volume"] == pytest.approx(0.5, rel=0.1)
-    hole = checked(write(tmp_path / "c.ply", (box()[0], box()[1][1:])), 2)
-    assert hole["mesh"]["boundary_edges"] == 3 and hole["intersection"] is None
-    missing = checked(tmp_path / "d.ply", 2)
-    assert "must exist" in missing["error"] and missing["mesh"] is None
-
-
-def test_check_quiet_says_it_with_the_exit_code(tmp_path, capsys):
-    assert main(["check", write(tmp_path / "a.ply", box()), "--rays", "32", "--quiet"]) == 0
-    assert capsys.readouterr() == ("", "")
-
-
-def test_check_as_a_process(tmp_path):
-    path = write(tmp_path / "a.ply", join(box(), box(center=(0.5, 0, 0))))
-    command = [sys.executable, "-m", "spt_jax", "check", path, "--rays", "64"]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert found.returncode == 1 and found.stderr == ""
-    assert "V_out" in found.stdout and "\x1b" not in found.stdout
 
 
 def test_the_demo_frames_are_bundled_and_distinct():

@@ -1,43 +1,23 @@
-"""The penalty as a JAX function: values, derivatives, transformations and wrong input."""
+"""The penalty as a JAX function: values, derivatives and transformations."""
 
-import ipctk
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 from helpers import (
-    body_faces,
-    box,
     embedded_body,
     inverted,
     join,
     lens_volume,
     mocap,
     moved,
-    posed_bodies,
     random_rotation,
-    sampling,
     sphere,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers_penalty import FACES, HALF, PAIR, as_jax, loss
 from jax.test_util import check_grads
 
 from spt_jax import classify_vertices, host, paper_penalty, penalty, self_intersection_penalty
-from spt_jax.rays import measure
-
-PAIR = join(sphere(subdivisions=2), sphere(center=(1.2, 0.1, 0.05), subdivisions=2))
-FACES = PAIR[1].astype(np.int32)
-HALF = len(PAIR[0]) // 2
-
-
-def loss(vertices, faces=FACES):
-    return self_intersection_penalty(vertices, faces, rays=48)
-
-
-def as_jax(mesh, dtype):
-    return jnp.asarray(mesh[0], dtype)
 
 
 def test_value_and_gradient(dtype):
@@ -90,18 +70,6 @@ def test_gradient_on_the_body_is_the_derivative_of_the_value(x64):
         exact = jax.grad(along)(0.0, change)
         numeric = (along(1e-7, change) - along(-1e-7, change)) / 2e-7
         assert float(numeric) == pytest.approx(float(exact), rel=1e-3)
-
-
-@pytest.mark.parametrize("value", ["volume", "ratio"])
-@pytest.mark.parametrize("gradient", ["boundary", "vertex", "unit"])
-@pytest.mark.parametrize("mesh", [sphere(), join(box(), box(center=(1.5, 0, 0)))])
-def test_no_overlap_is_exactly_zero(dtype, mesh, gradient, value):
-    options = {"value": value, "gradient": gradient, "rays": 100}
-    found, slope = jax.value_and_grad(lambda v: self_intersection_penalty(v, mesh[1], **options))(
-        as_jax(mesh, dtype)
-    )
-    assert found == 0.0
-    np.testing.assert_array_equal(slope, 0.0)
 
 
 @pytest.mark.parametrize("gradient", ["vertex", "unit"])
@@ -260,167 +228,3 @@ def test_second_derivatives_take_the_penalty_as_linear(dtype):
 def test_forward_mode_says_no():
     with pytest.raises(TypeError, match="custom_vjp"):
         jax.jvp(loss, (as_jax(PAIR, "float32"),), (as_jax(PAIR, "float32"),))
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_vertices_that_are_not_finite_give_nan_and_no_gradient(dtype, bad):
-    vertices = as_jax(PAIR, dtype).at[5, 1].set(bad)
-    for run in (jax.value_and_grad(loss), jax.jit(jax.value_and_grad(loss))):
-        value, gradient = run(vertices)
-        assert np.isnan(value)
-        np.testing.assert_array_equal(gradient, 0.0)
-    # The rest of a batch is not touched.
-    batch = jnp.stack([as_jax(PAIR, dtype), vertices])
-    values, gradients = jax.vmap(jax.value_and_grad(loss))(batch)
-    assert values[0] == loss(batch[0]) and np.isnan(values[1])
-    assert np.abs(gradients[0]).max() > 0 and np.abs(gradients[1]).max() == 0
-
-
-def test_traced_faces_out_of_range_give_nan():
-    wrong = jnp.asarray(FACES).at[3, 1].set(len(PAIR[0]))
-    value, gradient = jax.jit(jax.value_and_grad(loss))(as_jax(PAIR, "float32"), wrong)
-    assert np.isnan(value) and np.abs(gradient).max() == 0
-
-
-def test_faces_seen_edge_on_make_no_overlap(dtype):
-    """Solids with walls along the rays, where rounding decides which rays hit them."""
-    cylinder = trimesh.creation.cylinder(0.5, 1.0)
-    cone = trimesh.creation.cone(0.5, 1.0)
-    for k in range(8):
-        turn = trimesh.transformations.rotation_matrix(k * np.pi / 4, [1, k % 3, 0])[:3, :3]
-        for solid in (cylinder, cone, trimesh.creation.box()):
-            for shift in ((0, 0, 0), (0, 0, 0.5)):
-                mesh = moved((np.array(solid.vertices), np.array(solid.faces)), turn, shift)
-                for rays in (16, 100, (64, 64)):
-                    value = self_intersection_penalty(as_jax(mesh, dtype), mesh[1], rays=rays)
-                    assert value == 0.0
-
-
-@settings(max_examples=150, deadline=None)
-@given(
-    st.sampled_from([box(), sphere(subdivisions=2), box((1, 2, 0.5))]),
-    st.sampled_from([(8, 8), (64, 64), (32, 64), 16, 64, 7]),
-    st.sampled_from([0.0, 1e-16, 1e-15, 1e-13, 1e-11, 1e-8]),
-    st.sampled_from([0.001, 0.5, 1.0, 10.0]),
-    st.sampled_from([1, 3]),
-    st.integers(0, 2**32 - 1),
-)
-def test_convex_solids_never_overlap(mesh, rays, noise, scale, directions, seed):
-    rng = np.random.default_rng(seed)
-    corner = rng.choice(mesh[0])
-    vertices = (mesh[0] - corner * rng.integers(0, 2)) * scale
-    vertices = vertices + noise * rng.normal(size=vertices.shape)
-    probes = measure.probe(vertices, mesh[1], sampling(rays, directions))
-    assert measure.volume(probes) == 0
-    assert not measure.labels(mesh[1], len(vertices), probes).any()
-
-
-def test_bodies_that_ipctk_calls_free_are_exactly_free():
-    """No self-intersection of the mesh by ipctk, an exact test: value and gradient are zero."""
-    faces = body_faces().astype(np.int32)
-    edges = ipctk.edges(faces)
-    for vertices in posed_bodies(
-        ["cartwheel/0034", "dance_a/0017", "dance_a/0035", "dance_a/0044"]
-    ):
-        mesh = ipctk.CollisionMesh(vertices, edges, faces)
-        assert not ipctk.has_intersections(mesh, vertices)
-        for rays in (512, (300, 300)):
-            value, gradient = jax.value_and_grad(
-                lambda v: self_intersection_penalty(v, faces, rays=rays)  # noqa: B023
-            )(jnp.asarray(vertices, "float32"))
-            assert value == 0.0 and np.abs(gradient).max() == 0.0
-
-
-def test_extreme_scales(x64):
-    vertices = jnp.asarray(moved(PAIR, random_rotation(np.random.default_rng(2)))[0])
-    value, gradient = jax.value_and_grad(loss)(vertices)
-    for exponent in (-300, -200, 200, 300):  # powers of two keep the lattice's pixels
-        scale = 2.0**exponent
-        scaled_value, scaled_gradient = jax.value_and_grad(loss)(vertices * scale)
-        assert float(scaled_value / scale / scale / scale) == pytest.approx(float(value))
-        np.testing.assert_allclose(scaled_gradient / scale / scale, gradient, atol=1e-12)
-
-
-def test_overflow_is_nan_and_no_crash(dtype):
-    huge = as_jax(PAIR, dtype) * np.asarray(1e30 if dtype == np.float32 else 1e307, dtype)
-    value, gradient = jax.value_and_grad(loss)(huge)
-    assert not value < np.inf  # too large for the dtype
-    assert not np.isnan(gradient).any()
-
-
-def test_meshes_without_triangles_or_extent_are_free():
-    none = np.zeros((0, 3), np.int32)
-    assert loss(jnp.zeros((0, 3)), none) == 0
-    assert jax.vmap(lambda v: loss(v, none))(jnp.zeros((2, 0, 3))).shape == (2,)
-    empty = np.zeros((0, 3), np.int32)
-    assert loss(jnp.zeros((4, 3)), empty) == 0
-    value, gradient = jax.value_and_grad(loss)(jnp.full((4, 3), 0.7), np.array([[0, 1, 2]]))
-    assert value == 0 and np.abs(gradient).max() == 0
-
-
-def _wrong(**options):
-    return lambda: self_intersection_penalty(jnp.asarray(PAIR[0], "float32"), FACES, **options)
-
-
-def _wrong_mesh(vertices, faces=FACES):
-    return lambda: self_intersection_penalty(vertices, faces)
-
-
-GOOD = jnp.asarray(PAIR[0], "float32")
-ERRORS = {
-    "vertices shape": (_wrong_mesh(GOOD[:, :2]), ValueError, "vertices must have shape"),
-    "vertices rank": (_wrong_mesh(GOOD[0]), ValueError, r"vertices must have shape .*got \(3,\)"),
-    "vertices dtype": (_wrong_mesh(jnp.ones((4, 3), "int32")), TypeError, "got int32"),
-    "vertices half": (_wrong_mesh(GOOD.astype("float16")), TypeError, "got float16"),
-    "faces shape": (_wrong_mesh(GOOD, FACES[:, :2]), ValueError, "faces must have shape"),
-    "faces rank": (_wrong_mesh(GOOD, FACES[0]), ValueError, r"faces must have shape .*\(3,\)"),
-    "faces dtype": (_wrong_mesh(GOOD, FACES * 1.0), TypeError, "faces must be whole numbers"),
-    "face too large": (
-        _wrong_mesh(GOOD, np.where(FACES == 7, len(GOOD), FACES)),
-        ValueError,
-        f"got index {len(GOOD)} for {len(GOOD)} vertices; indices are 0-based",
-    ),
-    "face negative": (_wrong_mesh(GOOD, FACES - 1), ValueError, "got index -1"),
-    "no rays": (_wrong(rays=0), ValueError, "rays must be from 1 to .*got 0"),
-    "far too many rays": (_wrong(rays=5000), ValueError, "from 1 to 4096 a side: got 5000"),
-    "negative rays": (_wrong(rays=(3, -4)), ValueError, r"got \(3, -4\)"),
-    "fractional rays": (_wrong(rays=3.5), TypeError, "whole number"),
-    "auto rays": (_wrong(rays="auto"), ValueError, "not in this version"),
-    "value": (_wrong(value="area"), ValueError, "value must be one of 'volume', 'ratio'"),
-    "gradient": (_wrong(gradient="exact"), ValueError, "gradient must be one of 'boundary'"),
-    "two directions": (_wrong(directions=2), ValueError, "directions must be 1, 3 or an array"),
-    "zero direction": (_wrong(directions=[[0, 0, 0]]), ValueError, "finite and not zero.*row 0"),
-    "nan direction": (
-        _wrong(directions=[[0, 0, 1], [np.nan, 0, 1]]), ValueError, "not zero.*row 1"
-    ),
-    "flat direction": (_wrong(directions=[0, 0, 1]), ValueError, r"got shape \(3,\)"),
-    "named direction": (_wrong(directions="up"), TypeError, "got 'up'"),
-    "backend": (_wrong(backend="cuda"), ValueError, "backend must be one of"),
-    "later backend": (_wrong(backend="xla"), ValueError, "not in this version"),
-    "margin": (_wrong(margin=0.01), ValueError, "margin is not in this version"),
-    "groups": (_wrong(face_groups=np.zeros(3)), ValueError, "face_groups is not in"),
-    "ignored": (_wrong(ignore_groups=((0, 1),)), ValueError, "ignore_groups is not in"),
-    "folds": (_wrong(folds=object()), ValueError, "folds is not in this version"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", ERRORS)
-def test_wrong_input_fails_when_traced(name, untyped):
-    call, kind, message = ERRORS[name]
-    with pytest.raises(kind, match=message):
-        call()
-    with pytest.raises(kind, match=message):
-        jax.eval_shape(call)
-
-
-def test_traced_directions_are_refused(untyped):
-    with pytest.raises(TypeError, match="directions must be known when traced"):
-        jax.jit(lambda d: self_intersection_penalty(GOOD, FACES, directions=d))(jnp.eye(3))
-
-
-def test_directions_scale_and_type_do_not_matter():
-    one = self_intersection_penalty(GOOD, FACES, rays=32, directions=[[0, 0, -2.5]])
-    assert one == self_intersection_penalty(GOOD, FACES, rays=32, directions=1)
-    assert one == self_intersection_penalty(GOOD, FACES, rays=32, directions=[[0, 0, -1e-200]])
-    three = self_intersection_penalty(GOOD, FACES, rays=32, directions=jnp.eye(3))
-    assert three == pytest.approx(float(one), rel=0.05)

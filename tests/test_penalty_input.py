@@ -1,0 +1,97 @@
+"""Wrong input: what fails when traced, and what comes back as NaN."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers_penalty import FACES, PAIR, as_jax, loss
+
+from spt_jax import self_intersection_penalty
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_vertices_that_are_not_finite_give_nan_and_no_gradient(dtype, bad):
+    vertices = as_jax(PAIR, dtype).at[5, 1].set(bad)
+    for run in (jax.value_and_grad(loss), jax.jit(jax.value_and_grad(loss))):
+        value, gradient = run(vertices)
+        assert np.isnan(value)
+        np.testing.assert_array_equal(gradient, 0.0)
+    # The rest of a batch is not touched.
+    batch = jnp.stack([as_jax(PAIR, dtype), vertices])
+    values, gradients = jax.vmap(jax.value_and_grad(loss))(batch)
+    assert values[0] == loss(batch[0]) and np.isnan(values[1])
+    assert np.abs(gradients[0]).max() > 0 and np.abs(gradients[1]).max() == 0
+
+
+def test_traced_faces_out_of_range_give_nan():
+    wrong = jnp.asarray(FACES).at[3, 1].set(len(PAIR[0]))
+    value, gradient = jax.jit(jax.value_and_grad(loss))(as_jax(PAIR, "float32"), wrong)
+    assert np.isnan(value) and np.abs(gradient).max() == 0
+
+
+def _wrong(**options):
+    return lambda: self_intersection_penalty(jnp.asarray(PAIR[0], "float32"), FACES, **options)
+
+
+def _wrong_mesh(vertices, faces=FACES):
+    return lambda: self_intersection_penalty(vertices, faces)
+
+
+GOOD = jnp.asarray(PAIR[0], "float32")
+ERRORS = {
+    "vertices shape": (_wrong_mesh(GOOD[:, :2]), ValueError, "vertices must have shape"),
+    "vertices rank": (_wrong_mesh(GOOD[0]), ValueError, r"vertices must have shape .*got \(3,\)"),
+    "vertices dtype": (_wrong_mesh(jnp.ones((4, 3), "int32")), TypeError, "got int32"),
+    "vertices half": (_wrong_mesh(GOOD.astype("float16")), TypeError, "got float16"),
+    "faces shape": (_wrong_mesh(GOOD, FACES[:, :2]), ValueError, "faces must have shape"),
+    "faces rank": (_wrong_mesh(GOOD, FACES[0]), ValueError, r"faces must have shape .*\(3,\)"),
+    "faces dtype": (_wrong_mesh(GOOD, FACES * 1.0), TypeError, "faces must be whole numbers"),
+    "face too large": (
+        _wrong_mesh(GOOD, np.where(FACES == 7, len(GOOD), FACES)),
+        ValueError,
+        f"got index {len(GOOD)} for {len(GOOD)} vertices; indices are 0-based",
+    ),
+    "face negative": (_wrong_mesh(GOOD, FACES - 1), ValueError, "got index -1"),
+    "no rays": (_wrong(rays=0), ValueError, "rays must be from 1 to .*got 0"),
+    "far too many rays": (_wrong(rays=5000), ValueError, "from 1 to 4096 a side: got 5000"),
+    "negative rays": (_wrong(rays=(3, -4)), ValueError, r"got \(3, -4\)"),
+    "fractional rays": (_wrong(rays=3.5), TypeError, "whole number"),
+    "auto rays": (_wrong(rays="auto"), ValueError, "not in this version"),
+    "value": (_wrong(value="area"), ValueError, "value must be one of 'volume', 'ratio'"),
+    "gradient": (_wrong(gradient="exact"), ValueError, "gradient must be one of 'boundary'"),
+    "two directions": (_wrong(directions=2), ValueError, "directions must be 1, 3 or an array"),
+    "zero direction": (_wrong(directions=[[0, 0, 0]]), ValueError, "finite and not zero.*row 0"),
+    "nan direction": (
+        _wrong(directions=[[0, 0, 1], [np.nan, 0, 1]]), ValueError, "not zero.*row 1"
+    ),
+    "flat direction": (_wrong(directions=[0, 0, 1]), ValueError, r"got shape \(3,\)"),
+    "named direction": (_wrong(directions="up"), TypeError, "got 'up'"),
+    "backend": (_wrong(backend="cuda"), ValueError, "backend must be one of"),
+    "later backend": (_wrong(backend="xla"), ValueError, "not in this version"),
+    "margin": (_wrong(margin=0.01), ValueError, "margin is not in this version"),
+    "groups": (_wrong(face_groups=np.zeros(3)), ValueError, "face_groups is not in"),
+    "ignored": (_wrong(ignore_groups=((0, 1),)), ValueError, "ignore_groups is not in"),
+    "folds": (_wrong(folds=object()), ValueError, "folds is not in this version"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_wrong_input_fails_when_traced(name, untyped):
+    call, kind, message = ERRORS[name]
+    with pytest.raises(kind, match=message):
+        call()
+    with pytest.raises(kind, match=message):
+        jax.eval_shape(call)
+
+
+def test_traced_directions_are_refused(untyped):
+    with pytest.raises(TypeError, match="directions must be known when traced"):
+        jax.jit(lambda d: self_intersection_penalty(GOOD, FACES, directions=d))(jnp.eye(3))
+
+
+def test_directions_scale_and_type_do_not_matter():
+    one = self_intersection_penalty(GOOD, FACES, rays=32, directions=[[0, 0, -2.5]])
+    assert one == self_intersection_penalty(GOOD, FACES, rays=32, directions=1)
+    assert one == self_intersection_penalty(GOOD, FACES, rays=32, directions=[[0, 0, -1e-200]])
+    three = self_intersection_penalty(GOOD, FACES, rays=32, directions=jnp.eye(3))
+    assert three == pytest.approx(float(one), rel=0.05)

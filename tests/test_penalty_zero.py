@@ -1,0 +1,112 @@
+"""Exactly zero where nothing overlaps: solids seen edge-on, bodies; and extreme sizes."""
+
+import ipctk
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from helpers import (
+    body_faces,
+    box,
+    join,
+    moved,
+    posed_bodies,
+    random_rotation,
+    sampling,
+    sphere,
+)
+from helpers_penalty import PAIR, as_jax, loss
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spt_jax import self_intersection_penalty
+from spt_jax.rays import measure
+
+
+@pytest.mark.parametrize("value", ["volume", "ratio"])
+@pytest.mark.parametrize("gradient", ["boundary", "vertex", "unit"])
+@pytest.mark.parametrize("mesh", [sphere(), join(box(), box(center=(1.5, 0, 0)))])
+def test_no_overlap_is_exactly_zero(dtype, mesh, gradient, value):
+    options = {"value": value, "gradient": gradient, "rays": 100}
+    found, slope = jax.value_and_grad(lambda v: self_intersection_penalty(v, mesh[1], **options))(
+        as_jax(mesh, dtype)
+    )
+    assert found == 0.0
+    np.testing.assert_array_equal(slope, 0.0)
+
+
+def test_faces_seen_edge_on_make_no_overlap(dtype):
+    """Solids with walls along the rays, where rounding decides which rays hit them."""
+    cylinder = trimesh.creation.cylinder(0.5, 1.0)
+    cone = trimesh.creation.cone(0.5, 1.0)
+    for k in range(8):
+        turn = trimesh.transformations.rotation_matrix(k * np.pi / 4, [1, k % 3, 0])[:3, :3]
+        for solid in (cylinder, cone, trimesh.creation.box()):
+            for shift in ((0, 0, 0), (0, 0, 0.5)):
+                mesh = moved((np.array(solid.vertices), np.array(solid.faces)), turn, shift)
+                for rays in (16, 100, (64, 64)):
+                    value = self_intersection_penalty(as_jax(mesh, dtype), mesh[1], rays=rays)
+                    assert value == 0.0
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from([box(), sphere(subdivisions=2), box((1, 2, 0.5))]),
+    st.sampled_from([(8, 8), (64, 64), (32, 64), 16, 64, 7]),
+    st.sampled_from([0.0, 1e-16, 1e-15, 1e-13, 1e-11, 1e-8]),
+    st.sampled_from([0.001, 0.5, 1.0, 10.0]),
+    st.sampled_from([1, 3]),
+    st.integers(0, 2**32 - 1),
+)
+def test_convex_solids_never_overlap(mesh, rays, noise, scale, directions, seed):
+    rng = np.random.default_rng(seed)
+    corner = rng.choice(mesh[0])
+    vertices = (mesh[0] - corner * rng.integers(0, 2)) * scale
+    vertices = vertices + noise * rng.normal(size=vertices.shape)
+    probes = measure.probe(vertices, mesh[1], sampling(rays, directions))
+    assert measure.volume(probes) == 0
+    assert not measure.labels(mesh[1], len(vertices), probes).any()
+
+
+def test_bodies_that_ipctk_calls_free_are_exactly_free():
+    """No self-intersection of the mesh by ipctk, an exact test: value and gradient are zero."""
+    faces = body_faces().astype(np.int32)
+    edges = ipctk.edges(faces)
+    for vertices in posed_bodies(
+        ["cartwheel/0034", "dance_a/0017", "dance_a/0035", "dance_a/0044"]
+    ):
+        mesh = ipctk.CollisionMesh(vertices, edges, faces)
+        assert not ipctk.has_intersections(mesh, vertices)
+        for rays in (512, (300, 300)):
+            value, gradient = jax.value_and_grad(
+                lambda v: self_intersection_penalty(v, faces, rays=rays)  # noqa: B023
+            )(jnp.asarray(vertices, "float32"))
+            assert value == 0.0 and np.abs(gradient).max() == 0.0
+
+
+def test_extreme_scales(x64):
+    vertices = jnp.asarray(moved(PAIR, random_rotation(np.random.default_rng(2)))[0])
+    value, gradient = jax.value_and_grad(loss)(vertices)
+    for exponent in (-300, -200, 200, 300):  # powers of two keep the lattice's pixels
+        scale = 2.0**exponent
+        scaled_value, scaled_gradient = jax.value_and_grad(loss)(vertices * scale)
+        assert float(scaled_value / scale / scale / scale) == pytest.approx(float(value))
+        np.testing.assert_allclose(scaled_gradient / scale / scale, gradient, atol=1e-12)
+
+
+def test_overflow_is_nan_and_no_crash(dtype):
+    huge = as_jax(PAIR, dtype) * np.asarray(1e30 if dtype == np.float32 else 1e307, dtype)
+    value, gradient = jax.value_and_grad(loss)(huge)
+    assert not value < np.inf  # too large for the dtype
+    assert not np.isnan(gradient).any()
+
+
+def test_meshes_without_triangles_or_extent_are_free():
+    none = np.zeros((0, 3), np.int32)
+    assert loss(jnp.zeros((0, 3)), none) == 0
+    assert jax.vmap(lambda v: loss(v, none))(jnp.zeros((2, 0, 3))).shape == (2,)
+    empty = np.zeros((0, 3), np.int32)
+    assert loss(jnp.zeros((4, 3)), empty) == 0
+    value, gradient = jax.value_and_grad(loss)(jnp.full((4, 3), 0.7), np.array([[0, 1, 2]]))
+    assert value == 0 and np.abs(gradient).max() == 0
