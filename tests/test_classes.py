@@ -66,16 +66,7 @@ def test_precedence_is_out_then_in_then_clear():
     faces = np.array([[0, 1, 2], [2, 3, 4], [4, 5, 6], [7, 8, 9]])
 
     def overlaps(face, class_sign):
-        none = np.zeros(len(face))
-        return Overlaps(
-            face=np.array(face),
-            ray=none.astype(int),
-            sign=none.astype(int),
-            barycentric=np.zeros((len(face), 3)),
-            depth=none,
-            class_sign=np.array(class_sign),
-            length=0.0,
-        )
+        return Overlaps(np.array(face), np.zeros((len(face), 3)), np.array(class_sign), 0.0)
 
     # 2 is a corner of an out and of an in triangle, 4 of an in and of a clear one; nothing
     # reaches 7, 8 and 9.

@@ -28,9 +28,8 @@ class Overlaps:
     """The crossings that bound overlapped gaps, and what they enclose.
 
     Attributes:
-        face, ray, sign: as in `Crossings`, for these crossings alone.
-        barycentric: of the point where the ray crosses the face.
-        depth: of that point, along the ray.
+        face: the triangle that is crossed.
+        barycentric: of the point where the ray crosses it.
         class_sign: sign(w_out), the crossing's class: +1 on V_out, -1 on V_in, 0 where the gaps
             on both of its sides count alike (never, but for gaps too thin to count).
         length: the sum over gaps of phi(w) * length of the whole beam; times the area of a ray
@@ -38,10 +37,7 @@ class Overlaps:
     """
 
     face: Int[np.ndarray, "K"]
-    ray: Int[np.ndarray, "K"]
-    sign: Int[np.ndarray, "K"]
     barycentric: Float[np.ndarray, "K 3"]
-    depth: Float[np.ndarray, "K"]
     class_sign: Int[np.ndarray, "K"]
     length: float
 
@@ -75,8 +71,8 @@ def find_overlaps(
     bounds[gap] = bounds[gap + 1] = True
     crossing = np.flatnonzero(bounds)
     start = np.searchsorted(crossing, gap)
-    face, ray = crossings.face[crossing], crossings.ray[crossing]
-    barycentric = _barycentric(beam, points, faces[face], ray)
+    face = crossings.face[crossing]
+    barycentric = _barycentric(beam, points, faces[face], crossings.ray[crossing])
     depth = np.einsum("kc,kc->k", barycentric, points.depth[faces[face]])
 
     length = depth[start + 1] - depth[start]
@@ -87,9 +83,8 @@ def find_overlaps(
     by_depth = np.bincount(start + 1, weight, len(crossing)) - np.bincount(
         start, weight, len(crossing)
     )
-    sign = crossings.sign[crossing]
-    class_sign = (-sign * by_depth).astype(np.int64)
-    return Overlaps(face, ray, sign, barycentric, depth, class_sign, float(weight @ length))
+    class_sign = (-crossings.sign[crossing] * by_depth).astype(np.int64)
+    return Overlaps(face, barycentric, class_sign, float(weight @ length))
 
 
 def _edge_on(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:

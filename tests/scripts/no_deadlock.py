@@ -56,8 +56,7 @@ def work(name: str) -> None:
     for num_bytes in (10_000, 90_000, 147_000, 480_000, 2_000_000, 8_000_000):
         vertices, faces = padded(num_bytes)
         for run in (eager, step):
-            # Thirty calls each, fewer of them outside jit, where dispatching one takes longest.
-            results = [run(vertices, faces) for _ in range(30 if run is step else 10)]
+            results = [run(vertices, faces) for _ in range(30)]
             for value, gradient in results:
                 assert abs(float(value) - 0.5) < 0.1 and gradient.shape == vertices.shape
     vertices, faces = padded(147_000)
