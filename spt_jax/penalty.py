@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import as_backend, as_choice, as_directions, as_mesh, as_rays
+from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host
 from spt_jax.rays import measure
 from spt_jax.rays.measure import Gradient, Map, Sampling, Value
@@ -50,8 +51,11 @@ def self_intersection_penalty(
             array. With one, "boundary" is the exact derivative of the sampled volume; with
             several, crossings are weighed by how well their direction sees the triangle, which
             is closer to the limit of many rays.
-        margin, face_groups, ignore_groups, folds: reserved; other values than the defaults
-            raise.
+        margin: how far apart sheets shall be, in the vertices' unit. What is measured is the
+            surface moved outwards by half of it, `spt_jax.geometry.inflate`: where that no longer
+            overlaps, value and gradient are zero and sheets that face each other are `margin`
+            apart. Concave creases narrower than the margin fold when moved, and count.
+        face_groups, ignore_groups, folds: reserved; other values than the defaults raise.
         backend: "auto" or "numpy".
 
     Returns:
@@ -59,15 +63,16 @@ def self_intersection_penalty(
         not finite or a traced face is out of range.
 
     Raises:
-        TypeError: vertices not float32 or float64; faces not whole numbers; rays or directions
-            that are no numbers, or are traced.
+        TypeError: vertices not float32 or float64; faces not whole numbers; rays, directions or
+            margin that are no numbers, or are traced.
         ValueError: wrong shapes; a face out of range; rays not positive; directions zero or not
-            finite; an unknown option.
+            finite; a margin that is negative or not finite; an unknown option.
 
     Differentiation: reverse mode (`jax.grad`, `jax.vjp`, `jac="bwd"` in optimistix) with respect to
         vertices. The gradient is computed with the value and held fixed: in second derivatives
-        the penalty counts as linear. There is no forward mode. Inside `jax.shard_map` pass it
-        check_vma=False.
+        the penalty counts as linear. There is no forward mode. With a margin, every kind of
+        gradient is that of the moved surface, carried back to `vertices` by the chain rule. Inside
+        `jax.shard_map` pass it check_vma=False.
 
     Example:
         >>> import jax, trimesh
@@ -84,13 +89,16 @@ def self_intersection_penalty(
         -1.0
     """
     vertices, faces = as_mesh(vertices, faces)
-    _refuse_reserved(margin, face_groups, ignore_groups, folds)
+    _refuse_reserved(face_groups, ignore_groups, folds)
     as_backend(backend)
+    apart = _as_margin(margin)
     options = _Options(
         as_choice("value", value, Value),
         as_choice("gradient", gradient, Gradient),
         Sampling(as_rays(rays), as_directions(directions)),
     )
+    if apart:
+        vertices = inflate(vertices, faces, apart / 2)
     return _penalty(options, vertices, faces)
 
 
@@ -203,9 +211,22 @@ def _value_of(vertices, faces, probes, options: _Options) -> np.ndarray:
     return np.array(np.count_nonzero(label) / max(len(label), 1))
 
 
-def _refuse_reserved(margin: Any, face_groups: Any, ignore_groups: Any, folds: Any) -> None:
+def _as_margin(margin: Any) -> float:
+    if isinstance(margin, bool) or not isinstance(margin, (int, float, np.integer, np.floating)):
+        raise TypeError(
+            f"margin must be a number known when traced: got {margin!r}; pass a float, in the "
+            "vertices' unit."
+        )
+    if not 0 <= margin < np.inf:
+        raise ValueError(
+            f"margin must be finite and not negative: got {margin!r}; 0 measures the surface as "
+            "it is."
+        )
+    return float(margin)
+
+
+def _refuse_reserved(face_groups: Any, ignore_groups: Any, folds: Any) -> None:
     reserved = {
-        "margin": not (isinstance(margin, (int, float, np.number)) and margin == 0),
         "face_groups": face_groups is not None,
         "ignore_groups": ignore_groups is not None and ignore_groups != (),
         "folds": folds is not None,
