@@ -1,11 +1,14 @@
 """Where the detection rays go: directions, screens and the lattice that they are snapped to."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-Rays = int | tuple[int, int]
+from spt_jax.rays.tiles import Tiles
+
+Rays = int | tuple[int, int] | Literal["auto"]
 
 # Pixel sizes come from this many steps per factor of two. Coarse enough that a mesh which moves
 # a little keeps its pixel, fine enough that `rays` means what it says to within 9 %.
@@ -38,12 +41,14 @@ class Beam:
         pixel: width and height of a pixel, in the mesh's unit.
         origin: where the screen's first ray is, (column, row) in pixels from the world's origin.
         shape: rows and columns of the screen.
+        tiles: where on the screen rays are cast; None: everywhere.
     """
 
     frame: Float[np.ndarray, "3 3"]
     pixel: Float[np.ndarray, "2"]
     origin: Float[np.ndarray, "2"]
     shape: tuple[int, int]
+    tiles: Tiles | None = None
 
     @property
     def direction(self) -> Float[np.ndarray, "3"]:
@@ -54,6 +59,23 @@ class Beam:
     def ray_area(self) -> float:
         """Area of screen that one ray stands for."""
         return float(self.pixel[0] * self.pixel[1])
+
+    @property
+    def num_rays(self) -> int:
+        """Rays of the beam, those counted that miss the mesh."""
+        return self.shape[0] * self.shape[1] if self.tiles is None else self.tiles.num_pixels
+
+    def number(self, row: Int[np.ndarray, "N"], column: Int[np.ndarray, "N"]):
+        """The rays' numbers; they rise by one from column to column."""
+        if self.tiles is None:
+            return row * self.shape[1] + column
+        return self.tiles.number(row, column)
+
+    def locate(self, ray: Int[np.ndarray, "N"]):
+        """Row and column of numbered rays."""
+        if self.tiles is None:
+            return np.divmod(ray, self.shape[1])
+        return self.tiles.locate(ray)
 
 
 @dataclass(frozen=True)
@@ -87,7 +109,9 @@ def screen_frame(direction: Float[np.ndarray, "3"], turn: float = 0.0) -> Float[
 
 
 def aim(
-    vertices: Float[np.ndarray, "V 3"], direction: Float[np.ndarray, "3"], rays: Rays
+    vertices: Float[np.ndarray, "V 3"],
+    direction: Float[np.ndarray, "3"],
+    rays: int | tuple[int, int],
 ) -> tuple[Beam, ScreenPoints]:
     """A beam that covers the mesh, and the mesh's vertices in its coordinates.
 
@@ -96,18 +120,42 @@ def aim(
     (rows, columns) the screen stays along the frame's axes and each side gets its own pixel. In
     both cases the pixel is the next size down on a fixed ladder: up to 9 % more rays than asked.
     """
-    frame = screen_frame(direction)
-    extent = np.ptp(vertices @ frame[:2].T, axis=0)
     if isinstance(rays, tuple):
-        pixel = _ladder(extent / np.array([rays[1], rays[0]]))
-    else:
-        pixel = _ladder(np.full(2, extent.max() / rays))
-        frame = screen_frame(direction, _TURN)
+        frame = screen_frame(direction)
+        extent = np.ptp(vertices @ frame[:2].T, axis=0)
+        return on_lattice(vertices, frame, _ladder(extent / np.array([rays[1], rays[0]])))
+    return on_lattice(vertices, turned_frame(direction), square_pixel(vertices, direction, rays))
+
+
+def turned_frame(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The frame of a screen of square pixels, turned away from the world's axes."""
+    return screen_frame(direction, _TURN)
+
+
+def square_pixel(
+    vertices: Float[np.ndarray, "V 3"], direction: Float[np.ndarray, "3"], rays: int
+) -> Float[np.ndarray, "2"]:
+    """The ladder's pixel that puts at least so many rays along the longer side of the outline."""
+    extent = np.ptp(vertices @ screen_frame(direction)[:2].T, axis=0).max()
+    return _ladder(np.full(2, extent / rays))
+
+
+def on_lattice(
+    vertices: Float[np.ndarray, "V 3"],
+    frame: Float[np.ndarray, "3 3"],
+    pixel: Float[np.ndarray, "2"],
+    block: int = 1,
+) -> tuple[Beam, ScreenPoints]:
+    """The beam of this frame and pixel that covers the mesh, and the vertices on its screen.
+
+    The screen's first ray is one of those whose number on the world's lattice is a multiple of
+    `block`, so blocks of so many rays lie at the same places in the world for every mesh.
+    """
     column, row, depth = frame @ vertices.T
     column /= pixel[0]
     row /= pixel[1]
     lowest = np.array([column.min(), row.min()])
-    origin = np.floor(lowest + _SHIFT) - _SHIFT
+    origin = np.floor((lowest + _SHIFT) / block) * block - _SHIFT
     column -= origin[0]
     row -= origin[1]
     shape = (int(row.max()) + 2, int(column.max()) + 2)

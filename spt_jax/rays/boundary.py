@@ -36,7 +36,7 @@ def boundary_gradient(
     volume; with several, a grazing crossing, whose area is unbounded and badly sampled, weighs
     next to nothing and the directions that see its triangle well take over.
     """
-    corners = faces[overlaps.face]
+    corners = faces[overlaps.ends.ravel()]
     normal = area_normals(vertices, corners)
     # The weight does not depend on the normal's length; squares of tiny or huge ones would.
     longest = np.abs(normal).max(axis=1, initial=0.0)
@@ -45,13 +45,14 @@ def boundary_gradient(
     seen = np.einsum("kd,kd->k", cosines, cosines)
     # area * (n.d)^2 / sum (n.d')^2 * n, with lengths of normals cancelling: no root, no division
     # by a cosine that may vanish.
-    weight = overlaps.class_sign * np.abs(normal @ beam.direction) * beam.ray_area
+    weight = np.repeat(overlaps.class_sign, 2) * np.abs(normal @ beam.direction) * beam.ray_area
     weight = weight / np.where(seen > 0, seen, 1.0)
     force = weight[:, None] * normal
     vertex = corners.ravel()
+    barycentric = overlaps.barycentric.reshape(-1, 3)
     gradient = np.empty(vertices.shape)
     for axis in range(3):
-        share = (overlaps.barycentric * force[:, axis, None]).ravel()
+        share = (barycentric * force[:, axis, None]).ravel()
         gradient[:, axis] = np.bincount(vertex, share, len(vertices))
     return gradient
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from spt_jax.rays.beam import Beam, ScreenPoints
+from spt_jax.rays.tiles import Tiles
 
 # Depth is quantised only for the sort; below this many bits the packed key would confuse sheets
 # that are a few micrometres apart on a body, and a wider two-part sort takes over.
@@ -34,7 +35,7 @@ class Crossings:
     """Crossings of one beam with a mesh, sorted by ray and then by depth.
 
     Attributes:
-        ray: flat index row * columns + column of the ray.
+        ray: number of the ray, as in `Beam.locate`.
         face: the triangle that is crossed.
         sign: +1 where the ray enters (the triangle faces it), -1 where it leaves.
         depth_quantum: two crossings nearer than this may stand in the wrong order.
@@ -61,11 +62,10 @@ def cast(
     """
     near = points.depth.min(initial=np.inf)
     thickness = points.depth.max(initial=-np.inf) - near
-    spans = _spans(points, faces)
+    spans = _spans(points, faces) if beam.tiles is None else _spans_within(beam.tiles, points, faces)
 
-    rows, columns = beam.shape
     face_bits = max(len(faces) - 1, 1).bit_length()
-    ray_bits = (rows * columns).bit_length()
+    ray_bits = beam.num_rays.bit_length()
     depth_bits = min(_MOST_DEPTH_BITS, 62 - ray_bits - face_bits)
     packed = depth_bits >= _FEWEST_DEPTH_BITS
     if not packed:
@@ -76,13 +76,13 @@ def cast(
     # One repeat, then takes: np.repeat costs three times a take.
     of_span = np.repeat(np.arange(len(spans.width)), spans.width)
     step = np.arange(len(of_span)) - (np.cumsum(spans.width) - spans.width)[of_span]
-    ray = (spans.row * columns + spans.first_column)[of_span] + step
+    ray = beam.number(spans.row, spans.first_column)[of_span] + step
     depth = ((spans.first_depth - near) * per_unit)[of_span]
     depth += (spans.depth_step * per_unit)[of_span] * step
     np.clip(depth, 0.0, steps, out=depth)
 
     open_rays, kept = _worth_sorting(
-        rows * columns, ray, depth, spans.leaves.astype(np.int64)[of_span], simple_rays
+        beam.num_rays, ray, depth, spans.leaves.astype(np.int64)[of_span], simple_rays
     )
     met = len(ray)
     if kept is not None:
@@ -152,6 +152,24 @@ class _Spans:
     leaves: np.ndarray
     first_depth: Float[np.ndarray, "S"]
     depth_step: Float[np.ndarray, "S"]
+
+
+def _spans_within(tiles: Tiles, points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> _Spans:
+    # All triangles that touch a tile are there, so signs cancel on every ray of the tile.
+    face = tiles.touched_by(points.row, points.column, faces)
+    spans = _spans(points, faces[face])
+    span, first_column, width = tiles.clip(spans.row, spans.first_column, spans.width)
+    depth_step = spans.depth_step[span]
+    skipped = first_column - spans.first_column[span]
+    return _Spans(
+        face=face[spans.face[span]],
+        row=spans.row[span],
+        first_column=first_column,
+        width=width,
+        leaves=spans.leaves[span],
+        first_depth=spans.first_depth[span] + skipped * depth_step,
+        depth_step=depth_step,
+    )
 
 
 def _spans(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> _Spans:

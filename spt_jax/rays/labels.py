@@ -20,5 +20,5 @@ def triangle_labels(
     label = np.zeros(num_vertices, np.int8)
     for value in (INSIDE, OUT):
         for found in overlaps:
-            label[faces[found.face[np.sign(found.class_sign) == value]]] = value
+            label[faces[found.ends[found.class_sign == value]]] = value
     return label

@@ -1,12 +1,18 @@
-"""Counters along each ray, the overlap they enclose, and its derivative by depth.
+"""Counters along each ray and the overlaps that they enclose.
 
 The counter after a crossing is the winding number w of the gap that follows it (Algorithm 1,
 lines 16-18, for any depth). A gap counts phi(w) = max(w - 1, 0) + max(-w, 0) times: nothing
 outside and once inside, once where two parts overlap, twice where three do, once where the
 surface is inside out.
+
+That is the sum over the levels l = 2, 3, ... of whether w >= l, and over l = 0, -1, ... of whether
+w < l. So the overlap of a ray is a sum of intervals, one level each, and every crossing whose
+class sign(w_out) is not zero ends exactly one of them. An interval belongs to four sheets: the two
+that bound it, and the two that open and close the solid around it, which bound the interval one
+level down.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,21 +31,28 @@ _THINNEST = 1e-7
 
 @dataclass(frozen=True)
 class Overlaps:
-    """The crossings that bound overlapped gaps, and what they enclose.
+    """The overlapped intervals on the rays of a beam.
 
     Attributes:
-        face: the triangle that is crossed.
-        barycentric: of the point where the ray crosses it.
-        class_sign: sign(w_out), the crossing's class: +1 on V_out, -1 on V_in, 0 where the gaps
-            on both of its sides count alike (never, but for gaps too thin to count).
-        length: the sum over gaps of phi(w) * length of the whole beam; times the area of a ray
-            this is the overlap volume.
+        ends: the triangles that each interval begins and ends at.
+        around: the triangles that open and close the solid around it, outside which it has one
+            level less; -1 for an interval inside out, which has none.
+        barycentric: of the two points where the ray crosses `ends`.
+        class_sign: sign(w_out), the class of both ends: +1 on V_out, -1 on V_in.
+        length: from end to end; the sum times the area of a ray is the overlap volume.
     """
 
-    face: Int[np.ndarray, "K"]
-    barycentric: Float[np.ndarray, "K 3"]
-    class_sign: Int[np.ndarray, "K"]
-    length: float
+    ends: Int[np.ndarray, "N 2"]
+    around: Int[np.ndarray, "N 2"]
+    barycentric: Float[np.ndarray, "N 2 3"]
+    class_sign: Int[np.ndarray, "N"]
+    length: Float[np.ndarray, "N"]
+
+    def only(self, kept: Bool[np.ndarray, "N"]) -> "Overlaps":
+        """Some of the intervals."""
+        if kept.all():
+            return self
+        return replace(self, **{name: value[kept] for name, value in vars(self).items()})
 
 
 def winding_numbers(crossings: Crossings) -> Int[np.ndarray, "N"]:
@@ -51,40 +64,55 @@ def winding_numbers(crossings: Crossings) -> Int[np.ndarray, "N"]:
 def find_overlaps(
     beam: Beam, points: ScreenPoints, faces: Int[np.ndarray, "F 3"], crossings: Crossings
 ) -> Overlaps:
-    """The overlapped gaps of a beam, measured exactly where it matters.
+    """The overlapped intervals of a beam, measured exactly where it matters.
 
-    Only the few per cent of crossings that bound an overlapped gap get barycentric coordinates
-    and an exact depth; the rest were only sorted.
+    Only the few per cent of crossings that bound an interval get barycentric coordinates and an
+    exact depth; the rest were only sorted.
     """
-    winding = winding_numbers(crossings)
-    gap = np.flatnonzero(winding >> 1)  # all but 0 and 1
-    if len(gap):
+    # A crossing's level is the larger of the winding numbers on its two sides.
+    level = winding_numbers(crossings) + (crossings.sign < 0)
+    found = np.flatnonzero(level != 1)
+    if len(found):
         hit_edge_on = _edge_on(points, faces)[crossings.face]
         if hit_edge_on.any():
-            gap = gap[~np.isin(crossings.ray[gap], crossings.ray[hit_edge_on])]
-    weight = np.maximum(winding[gap] - 1, -winding[gap])
+            found = found[~np.isin(crossings.ray[found], crossings.ray[hit_edge_on])]
+    levels, ray = level[found], crossings.ray[found]
+    # Along a ray the crossings of one level open and close in turn.
+    lowest = levels.min(initial=0)
+    order = np.argsort(ray * (levels.max(initial=0) - lowest + 1) + levels - lowest, kind="stable")
+    pair = found[order].reshape(-1, 2)
+    levels = levels[order[::2]]
 
-    # Adjacent overlapped gaps form a run; crossings gap and gap + 1 bound each gap.
-    new_run = np.concatenate([[True], np.diff(gap) > 1])[: len(gap)]
-    run = np.cumsum(new_run) - 1
-    bounds = np.zeros(len(winding) + 1, bool)
-    bounds[gap] = bounds[gap + 1] = True
-    crossing = np.flatnonzero(bounds)
-    start = np.searchsorted(crossing, gap)
-    face = crossings.face[crossing]
-    barycentric = _barycentric(beam, points, faces[face], crossings.ray[crossing])
-    depth = np.einsum("kc,kc->k", barycentric, points.depth[faces[face]])
+    ends = crossings.face[pair]
+    barycentric = _barycentric(beam, points, faces[ends.ravel()], crossings.ray[pair.ravel()])
+    depth = np.einsum("kc,kc->k", barycentric, points.depth[faces[ends.ravel()]]).reshape(-1, 2)
+    length = depth[:, 1] - depth[:, 0]
 
-    length = depth[start + 1] - depth[start]
+    # Intervals within an outermost one, of level 2 or 0, form a run with it.
+    outermost = np.zeros(len(level), bool)
+    outermost[pair[(levels == 2) | (levels == 0), 0]] = True
+    run = np.cumsum(outermost)[pair[:, 0]]
     thinnest = max(2 * crossings.depth_quantum, _THINNEST * np.ptp(points.depth))
-    if len(gap):
-        weight = weight * (np.bincount(run, weight * length)[run] > thinnest)
-    # d(overlap)/d(depth): the gap in front of a crossing grows, the one behind it shrinks.
-    by_depth = np.bincount(start + 1, weight, len(crossing)) - np.bincount(
-        start, weight, len(crossing)
-    )
-    class_sign = (-crossings.sign[crossing] * by_depth).astype(np.int64)
-    return Overlaps(face, barycentric, class_sign, float(weight @ length))
+    kept = np.bincount(run, length)[run] > thinnest if len(run) else np.zeros(0, bool)
+    return Overlaps(
+        ends=ends,
+        around=_around(level, crossings.face, pair[:, 0], levels),
+        barycentric=barycentric.reshape(-1, 2, 3),
+        class_sign=np.sign(levels - 1),
+        length=length,
+    ).only(kept)
+
+
+def _around(level, face, opens, levels) -> Int[np.ndarray, "N 2"]:
+    around = np.full((len(opens), 2), -1)
+    for inner in np.unique(levels[levels > 1]):
+        rows = np.flatnonzero(levels == inner)
+        # To rise to a level a ray has to pass the one below, so the nearest crossings of that
+        # level before and after, on whichever ray, are on the same one.
+        below = np.flatnonzero(level == inner - 1)
+        close = np.searchsorted(below, opens[rows])
+        around[rows] = face[below[np.stack([close - 1, close], axis=1)]]
+    return around
 
 
 def _edge_on(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:
@@ -98,7 +126,7 @@ def _edge_on(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Bool[np.nda
 def _barycentric(
     beam: Beam, points: ScreenPoints, corners: Int[np.ndarray, "K 3"], ray: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "K 3"]:
-    row, column = np.divmod(ray, beam.shape[1])
+    row, column = beam.locate(ray)
     x0, x1, x2 = points.column[corners.T] - column
     y0, y1, y2 = points.row[corners.T] - row
     weights = np.stack([x1 * y2 - y1 * x2, x2 * y0 - y2 * x0, x0 * y1 - y0 * x1])

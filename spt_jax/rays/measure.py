@@ -37,7 +37,7 @@ class Probe:
     @property
     def volume(self) -> float:
         """E_d: the overlap lengths on the rays times the screen area of a ray."""
-        return self.overlaps.length * self.beam.ray_area
+        return float(self.overlaps.length.sum()) * self.beam.ray_area
 
 
 # map(function, directions); the caller may bring one that uses several threads.
