@@ -47,7 +47,7 @@ class RestGraph:
         cls, rest_vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
     ) -> "RestGraph":
         """The graph of a mesh; `rest_vertices` is `body.template` for a body."""
-        edges = np.asarray(ipctk.edges(np.asarray(faces, np.int32)), np.int64)
+        edges = edges_of(faces)
         length = np.linalg.norm(rest_vertices[edges[:, 0]] - rest_vertices[edges[:, 1]], axis=1)
         start, end = np.concatenate([edges, edges[:, ::-1]]).T
         shape = (len(rest_vertices), len(rest_vertices))
@@ -98,6 +98,11 @@ class FarCrossings(NamedTuple):
         """(edge, triangle) of each crossing beyond the threshold."""
         far = self.distance > self.threshold
         return list(zip(self.edge[far].tolist(), self.face[far].tolist(), strict=True))
+
+
+def edges_of(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
+    """Every edge of the triangles, once."""
+    return np.asarray(ipctk.edges(np.asarray(faces, np.int32)), np.int64)
 
 
 def crossing_pairs(
