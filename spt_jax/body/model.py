@@ -10,6 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float, Int
 
+from spt_jax.rest_surface import RestSurface
+
 from . import poses
 from .rotations import matrix_from_axis_angle
 from .skinning import (
@@ -137,6 +139,24 @@ class BodyModel(eqx.Module):
     def num_shape(self) -> int:
         """Number of shape coefficients."""
         return self.shape_basis.shape[-1]
+
+    @property
+    def rest_surface(self) -> RestSurface:
+        """The body's surface at rest, in the mean shape: what the penalty tells folds by.
+
+        Overlaps of sheets nearer to each other than 0.3 m along it are folds;
+        `body.rest_surface.within(0.2)` is for another distance.
+
+        Raises:
+            TypeError: inside jit, grad or vmap of a function that the body is an argument of. Take
+                it outside.
+
+        Example:
+            >>> from spt_jax.body import load_body
+            >>> load_body().rest_surface
+            RestSurface(24540 faces, distance=0.3)
+        """
+        return RestSurface(self.template, self.faces)
 
     def __call__(
         self,

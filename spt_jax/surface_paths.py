@@ -1,0 +1,192 @@
+"""Shortest paths along the edges of a mesh, tabulated from seeds; NumPy and SciPy only."""
+
+import functools
+import hashlib
+import threading
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+# Every piece of the mesh gets a seed.
+MOST_PIECES = 512
+# 512 seeds leave no triangle of the embedded body farther than 61 mm from one (25 mm on average).
+_SEEDS = 512
+# Entries of the table, 4 bytes each: meshes above 131,000 triangles get fewer seeds instead.
+_LARGEST_TABLE = 1 << 26
+# Bytes kept of what shortest paths have answered; a face's answer takes one bit per face.
+_MOST_ANSWERS = 64 << 20
+
+
+def surface_paths(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> "SurfacePaths":
+    """The shortest paths of a mesh; equal meshes share one object."""
+    return _shared(_Content(vertices, faces))
+
+
+@functools.lru_cache(maxsize=4)
+def _shared(content: "_Content") -> "SurfacePaths":
+    return SurfacePaths(content)
+
+
+class _Content:
+    """A mesh, hashed and compared by its bytes."""
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]):
+        self.vertices, self.faces = vertices, faces
+        size = f"{len(vertices)} {len(faces)} ".encode()
+        data = size + vertices.tobytes() + faces.tobytes()
+        self._digest = hashlib.blake2b(data, digest_size=32).digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content) and self._digest == other._digest
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+
+class SurfacePaths:
+    """Shortest paths along the edges of one mesh, between the centres of its triangles.
+
+    Attributes:
+        content: the mesh.
+        faces: its triangles.
+        pieces: how many parts without a common vertex they make.
+    """
+
+    def __init__(self, content: _Content):
+        self.content = content
+        self.faces = content.faces
+        corners = content.vertices[self.faces]
+        self._spokes = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2)
+        self._graph = _edge_graph(content.vertices, self.faces)
+        labels = connected_components(self._graph, directed=False)[1]
+        self.pieces = len(np.unique(labels[self.faces[:, 0]]))
+        self._lock = threading.Lock()
+        self._table: _Table | None = None
+        self._answers: dict[tuple[float, int], np.ndarray] = {}
+
+    @property
+    def slack(self) -> float:
+        """What rounding to float32 can move a distance by, and twice as much again."""
+        return 8 * float(np.finfo(np.float32).eps) * self._ready().extent
+
+    def bounds(
+        self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """From below and above, by the paths over the seed nearest to each."""
+        table = self._ready()
+        over_g = table.flat.take(f * table.seeds + table.nearest.take(g))
+        over_f = table.flat.take(g * table.seeds + table.nearest.take(f))
+        of_f, of_g = table.to_nearest.take(f), table.to_nearest.take(g)
+        lower = np.maximum(np.abs(over_g - of_g), np.abs(over_f - of_f))
+        upper = np.minimum(over_g + of_g, over_f + of_f)
+        return lower, upper
+
+    def near(
+        self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"], distance: float
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether pairs of one connected part are nearer, for the few that `bounds` leaves open."""
+        table = self._ready()
+        near = np.zeros(len(f), bool)
+        undecided = []
+        for start in range(0, len(f), 2048):  # 4 MB a side
+            part = slice(start, start + 2048)
+            to_f, to_g = table.rows[f[part]], table.rows[g[part]]
+            near[part] = (to_f + to_g).min(axis=1) < distance - self.slack
+            to_f -= to_g  # inf - inf, at seeds of other parts, is NaN: fmax leaves it out
+            lower = np.fmax.reduce(np.abs(to_f, out=to_f), axis=1)
+            undecided.append(start + np.flatnonzero(~near[part] & (lower < distance + self.slack)))
+        rest = np.concatenate(undecided) if undecided else np.zeros(0, int)
+        if len(rest):
+            near[rest] = self._answer(f[rest], g[rest], distance)
+        return near
+
+    def _answer(self, f, g, distance):
+        sources = np.unique(f)
+        with self._lock:
+            new = [s for s in sources.tolist() if (distance, s) not in self._answers]
+            bytes_each = -(-len(self.faces) // 8)
+            if (len(self._answers) + len(new)) * bytes_each > _MOST_ANSWERS:
+                self._answers.clear()
+                new = sources.tolist()
+            for start in range(0, len(new), 64):
+                part = new[start : start + 64]
+                for source, row in zip(part, self._from_centres(part, distance), strict=True):
+                    self._answers[distance, source] = np.packbits(row < distance)
+            rows = [self._answers[distance, s] for s in sources.tolist()]
+        byte = np.stack(rows)[np.searchsorted(sources, f), g >> 3]
+        return (byte >> (7 - (g & 7))) & 1 == 1
+
+    def _from_centres(self, sources, limit):
+        """Distances from the centres of a few faces to those of all; infinite beyond the limit."""
+        graph, spokes = self._graph, self._spokes
+        # The centres are nodes behind the vertices, with ways out to their corners and none in.
+        ways = graph.nnz + 3 * np.arange(1, len(sources) + 1)
+        vertices = len(self.content.vertices)
+        size = vertices + len(sources)
+        with_centres = csr_array(
+            (
+                np.concatenate([graph.data, spokes[sources].ravel()]),
+                np.concatenate([graph.indices, self.faces[sources].ravel()]),
+                np.concatenate([graph.indptr, ways]),
+            ),
+            shape=(size, size),
+        )
+        centres = np.arange(vertices, size)
+        to_vertices = dijkstra(with_centres, indices=centres, limit=limit)
+        rows = _to_centres(np.ascontiguousarray(to_vertices.T), self.faces, spokes).T
+        rows[np.arange(len(sources)), sources] = 0.0
+        return rows
+
+    def _ready(self) -> "_Table":
+        table = self._table
+        if table is None:
+            with self._lock:
+                table = self._table = self._table or _Table(
+                    self._graph, self.faces, self._spokes, self.pieces
+                )
+        return table
+
+
+class _Table:
+    """Distances from the seeds to the centres of all faces, and each face's nearest seed."""
+
+    def __init__(self, graph, faces, spokes, pieces):
+        used = np.unique(faces)
+        most = min(_SEEDS, len(used), max(_LARGEST_TABLE // max(len(faces), 1), pieces))
+        rows, nearest = [], np.full(len(used), np.inf)
+        while len(rows) < most and nearest.max() > 0:
+            rows.append(dijkstra(graph, indices=used[nearest.argmax()]))
+            nearest = np.minimum(nearest, rows[-1][used])
+        to_vertices = np.array(rows, np.float32).reshape(len(rows), graph.shape[0]).T
+        self.rows = _to_centres(to_vertices.copy(), faces, spokes.astype(np.float32))
+        self.flat = self.rows.reshape(-1)
+        self.seeds = self.rows.shape[1]
+        if len(faces):
+            self.nearest = self.rows.argmin(axis=1)
+            self.to_nearest = self.rows.min(axis=1)
+            self.extent = float(self.rows.max(initial=0.0, where=np.isfinite(self.rows)))
+        else:
+            self.nearest, self.to_nearest, self.extent = np.zeros(0, int), np.zeros(0, "f4"), 0.0
+
+
+def _to_centres(to_vertices, faces, spokes):
+    """(F, S) from (V, S): the shortest way to a centre, over any of its corners."""
+    best = to_vertices[faces[:, 0]] + spokes[:, :1]
+    for corner in (1, 2):
+        np.minimum(best, to_vertices[faces[:, corner]] + spokes[:, corner, None], out=best)
+    return best
+
+
+def _edge_graph(vertices, faces) -> csr_array:
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ends = np.unique(np.sort(ends, axis=1), axis=0)
+    length = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
+    # Sparse graphs take an entry of zero for no edge.
+    length = np.maximum(length, np.finfo(float).tiny)
+    rows, columns = np.concatenate([ends, ends[:, ::-1]]).T
+    shape = (len(vertices), len(vertices))
+    return csr_array(coo_array((np.tile(length, 2), (rows, columns)), shape=shape))
