@@ -67,16 +67,13 @@ def check_indices(faces: np.ndarray, num_vertices: int) -> None:
 
 
 def as_rays(rays: Any) -> Rays:
-    """A whole number of rays along the longer side, or (rows, columns).
+    """ "auto", a whole number of rays along the longer side, or (rows, columns).
 
     Raises:
         TypeError, ValueError: anything else, or a number out of 1 to 4096.
     """
     if isinstance(rays, str) and rays == "auto":
-        raise ValueError(
-            'rays="auto" is not in this version: got "auto"; pass a whole number, such as '
-            "rays=512 (the default), or (rows, columns)."
-        )
+        return "auto"
     if isinstance(rays, (tuple, list)) and len(rays) == 2:
         return _as_count(rays[0], rays), _as_count(rays[1], rays)
     return _as_count(rays, rays)
@@ -84,9 +81,7 @@ def as_rays(rays: Any) -> Rays:
 
 def _as_count(side: Any, rays: Any) -> int:
     if not isinstance(side, (int, np.integer)) or isinstance(side, bool):
-        raise TypeError(
-            f"rays must be a whole number or (rows, columns): got {rays!r}; 512 is a good start."
-        )
+        raise TypeError(f'rays must be "auto", a whole number or (rows, columns): got {rays!r}.')
     if side < 1 or side > MOST_RAYS:
         raise ValueError(
             f"rays must be from 1 to {MOST_RAYS} a side: got {rays!r}; 512 is a good start."
@@ -147,6 +142,25 @@ def as_choice(name: str, value: Any, choices: Any) -> Any:
         listed = ", ".join(repr(choice) for choice in allowed)
         raise ValueError(f"{name} must be one of {listed}: got {value!r}.")
     return value
+
+
+def as_margin(margin: Any) -> float:
+    """A distance to keep between sheets.
+
+    Raises:
+        TypeError, ValueError: no number, traced, negative or not finite.
+    """
+    if isinstance(margin, bool) or not isinstance(margin, (int, float, np.integer, np.floating)):
+        raise TypeError(
+            f"margin must be a number known when traced: got {margin!r}; pass a float, in the "
+            "vertices' unit."
+        )
+    if not 0 <= margin < np.inf:
+        raise ValueError(
+            f"margin must be finite and not negative: got {margin!r}; 0 measures the surface as "
+            "it is."
+        )
+    return float(margin)
 
 
 Backend = Literal["auto", "numpy", "xla"]

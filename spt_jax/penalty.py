@@ -8,11 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
-from spt_jax.arguments import as_backend, as_choice, as_directions, as_mesh, as_rays
+from spt_jax.arguments import (
+    as_backend,
+    as_choice,
+    as_directions,
+    as_margin,
+    as_mesh,
+    as_rays,
+)
+from spt_jax.exclusions import as_exclusions
 from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host
-from spt_jax.rays import measure
-from spt_jax.rays.measure import Gradient, Map, Sampling, Value
+from spt_jax.rays.exclusions import Exclusions
+from spt_jax.rays.measure import Gradient, Rule, Sampling, Value, measure, usable
+from spt_jax.rays.sheets import Map
+from spt_jax.rest_surface import RestSurface
 
 
 def self_intersection_penalty(
@@ -21,12 +31,13 @@ def self_intersection_penalty(
     *,
     value: Value = "volume",
     gradient: Gradient = "boundary",
-    rays: int | tuple[int, int] | str = 512,
+    rule: Rule = "vertex",
+    rays: int | tuple[int, int] | str = "auto",
     directions: Any = 3,
     margin: float = 0.0,
-    face_groups: Any = None,
+    face_groups: Integer[Array, "F"] | np.ndarray | None = None,
     ignore_groups: Any = (),
-    folds: Any = None,
+    folds: RestSurface | None = None,
     backend: str = "auto",
 ) -> Float[Array, "*batch"]:
     r"""Volume of a closed mesh's self-intersection, as a loss with its own exact gradient.
@@ -46,7 +57,13 @@ def self_intersection_penalty(
         gradient: "boundary", the derivative of the volume; "vertex", the paper's Eq. 9, which
             takes each triangle as wholly in or out; "unit", its Eq. 10, of length one at every
             vertex in self-intersection.
-        rays: rays along the longer side of the screen, or (rows, columns).
+        rule: how "ratio", "vertex" and "unit" class the vertices, as in `classify_vertices`.
+        rays: "auto": fine rays in the parts of the screen where triangles overlap, and none
+            elsewhere; at most 16,000 a beam, or 256 along the longer side where the overlaps fill
+            the screen. Or how many along the longer side of the whole screen, or (rows, columns).
+            The rays are fixed in the world in either case; with "auto" their spacing halves or
+            doubles when the outline of the overlaps has become four times smaller or larger, and
+            the volume then steps by the error of the quadrature.
         directions: 1 (along -z, the paper's camera), 3 orthogonal ones, or the rows of a D x 3
             array. With one, "boundary" is the exact derivative of the sampled volume; with
             several, crossings are weighed by how well their direction sees the triangle, which
@@ -55,7 +72,14 @@ def self_intersection_penalty(
             surface moved outwards by half of it, `spt_jax.geometry.inflate`: where that no longer
             overlaps, value and gradient are zero and sheets that face each other are `margin`
             apart. Concave creases narrower than the margin fold when moved, and count.
-        face_groups, ignore_groups, folds: reserved; other values than the defaults raise.
+        face_groups: a whole number for each triangle: its body part or person
+            (`body.part_groups`, `join_bodies`).
+        ignore_groups: pairs of groups whose overlaps do not count, such as ((0, 0), (1, 1)) for
+            "only between the two people". The pair of an overlap is that of the two solids that
+            overlap there.
+        folds: the surface at rest (`body.rest_surface`). Overlaps of sheets nearer to each other
+            than its `distance` along it are folds, which bending makes at armpits, elbows and
+            groins, and do not count. Which overlaps count is held fixed in the derivative.
         backend: "auto" or "numpy".
 
     Returns:
@@ -63,10 +87,11 @@ def self_intersection_penalty(
         not finite or a traced face is out of range.
 
     Raises:
-        TypeError: vertices not float32 or float64; faces not whole numbers; rays, directions or
-            margin that are no numbers, or are traced.
+        TypeError: vertices not float32 or float64; faces or groups not whole numbers; rays,
+            directions, margin or groups that are no numbers, or are traced; folds no RestSurface.
         ValueError: wrong shapes; a face out of range; rays not positive; directions zero or not
-            finite; a margin that is negative or not finite; an unknown option.
+            finite; a margin that is negative or not finite; groups or folds that do not fit the
+            faces; an unknown option.
 
     Differentiation: reverse mode (`jax.grad`, `jax.vjp`, `jac="bwd"` in optimistix) with respect to
         vertices. The gradient is computed with the value and held fixed: in second derivatives
@@ -80,7 +105,7 @@ def self_intersection_penalty(
         >>> box = trimesh.creation.box()
         >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.0, 0.0]))
         >>> vertices = jax.numpy.asarray(pair.vertices, "float32")
-        >>> loss = lambda v: self_intersection_penalty(v, pair.faces, rays=256)
+        >>> loss = lambda v: self_intersection_penalty(v, pair.faces)
         >>> volume, gradient = jax.value_and_grad(loss)(vertices)
         >>> print(f"{volume:.2f}")
         0.40
@@ -89,13 +114,14 @@ def self_intersection_penalty(
         -1.0
     """
     vertices, faces = as_mesh(vertices, faces)
-    _refuse_reserved(face_groups, ignore_groups, folds)
     as_backend(backend)
-    apart = _as_margin(margin)
+    apart = as_margin(margin)
     options = _Options(
         as_choice("value", value, Value),
         as_choice("gradient", gradient, Gradient),
+        as_choice("rule", rule, Rule),
         Sampling(as_rays(rays), as_directions(directions)),
+        as_exclusions(face_groups, ignore_groups, folds, faces.shape[0]),
     )
     if apart:
         vertices = inflate(vertices, faces, apart / 2)
@@ -142,6 +168,7 @@ def paper_penalty(
         faces,
         value="ratio",
         gradient="unit" if normalize else "vertex",
+        rule="triangle",
         rays=rays,
         directions=1,
     )
@@ -150,7 +177,9 @@ def paper_penalty(
 class _Options(NamedTuple):
     value: Value
     gradient: Gradient
+    rule: Rule
     sampling: Sampling
+    exclusions: Exclusions
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -181,56 +210,27 @@ def _scalar(vertices):
     return (), vertices.dtype.name
 
 
-def _value_on_host(vertices, faces, options: _Options, map_directions: Map):
-    return _measure(vertices, faces, options, map_directions, with_gradient=False)[:1]
+def _value_on_host(vertices, faces, options: _Options, map_tasks: Map):
+    return _measure(vertices, faces, options, map_tasks, with_gradient=False)[:1]
 
 
-def _value_and_gradient_on_host(vertices, faces, options: _Options, map_directions: Map):
-    return _measure(vertices, faces, options, map_directions, with_gradient=True)
+def _value_and_gradient_on_host(vertices, faces, options: _Options, map_tasks: Map):
+    return _measure(vertices, faces, options, map_tasks, with_gradient=True)
 
 
-def _measure(vertices, faces, options: _Options, map_directions: Map, *, with_gradient: bool):
+def _measure(vertices, faces, options: _Options, map_tasks: Map, *, with_gradient: bool):
     gradient = np.zeros_like(vertices)
-    if not measure.usable(vertices, faces):
+    if not usable(vertices, faces):
         return np.array(np.nan), gradient
     if faces.size == 0:
         return np.zeros(()), gradient
-    probes = measure.probe(vertices, faces, options.sampling, map_directions)
-    value = _value_of(vertices, faces, probes, options)
+    found = measure(vertices, faces, options.sampling, options.exclusions, map_tasks)
+    if options.value == "volume":
+        value = np.array(found.volume)
+    else:
+        value = np.mean(found.labels(options.rule) != 0)
     if with_gradient:
-        gradient = measure.gradient(vertices, faces, probes, options.gradient)
+        gradient = found.gradient(options.gradient, options.rule)
     if not (np.isfinite(value) and np.isfinite(gradient).all()):  # coordinates near overflow
         return np.array(np.nan), np.zeros_like(vertices)
     return value, gradient
-
-
-def _value_of(vertices, faces, probes, options: _Options) -> np.ndarray:
-    if options.value == "volume":
-        return np.array(measure.volume(probes))
-    label = measure.labels(faces, len(vertices), probes)
-    return np.array(np.count_nonzero(label) / max(len(label), 1))
-
-
-def _as_margin(margin: Any) -> float:
-    if isinstance(margin, bool) or not isinstance(margin, (int, float, np.integer, np.floating)):
-        raise TypeError(
-            f"margin must be a number known when traced: got {margin!r}; pass a float, in the "
-            "vertices' unit."
-        )
-    if not 0 <= margin < np.inf:
-        raise ValueError(
-            f"margin must be finite and not negative: got {margin!r}; 0 measures the surface as "
-            "it is."
-        )
-    return float(margin)
-
-
-def _refuse_reserved(face_groups: Any, ignore_groups: Any, folds: Any) -> None:
-    reserved = {
-        "face_groups": face_groups is not None,
-        "ignore_groups": ignore_groups is not None and ignore_groups != (),
-        "folds": folds is not None,
-    }
-    for name, used in reserved.items():
-        if used:
-            raise ValueError(f"{name} is not in this version: got a value; leave it out.")

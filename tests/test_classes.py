@@ -69,7 +69,7 @@ def test_precedence_is_out_then_in_then_clear():
         ends = np.stack([face, face], axis=1)
         count = len(ends)
         nothing = np.zeros((count, 2, 3)), np.array(class_sign), np.zeros(count)
-        return Overlaps(ends, np.full((count, 2), -1), *nothing)
+        return Overlaps(np.arange(count), ends, np.full((count, 2), -1), *nothing)
 
     # 2 is a corner of an out and of an in triangle, 4 of an in and of a clear one; nothing
     # reaches 7, 8 and 9.

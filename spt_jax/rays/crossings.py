@@ -62,7 +62,9 @@ def cast(
     """
     near = points.depth.min(initial=np.inf)
     thickness = points.depth.max(initial=-np.inf) - near
-    spans = _spans(points, faces) if beam.tiles is None else _spans_within(beam.tiles, points, faces)
+    spans = (
+        _spans(points, faces) if beam.tiles is None else _spans_within(beam.tiles, points, faces)
+    )
 
     face_bits = max(len(faces) - 1, 1).bit_length()
     ray_bits = beam.num_rays.bit_length()

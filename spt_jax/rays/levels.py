@@ -34,6 +34,7 @@ class Overlaps:
     """The overlapped intervals on the rays of a beam.
 
     Attributes:
+        ray: the ray's number, as in `Beam.locate`.
         ends: the triangles that each interval begins and ends at.
         around: the triangles that open and close the solid around it, outside which it has one
             level less; -1 for an interval inside out, which has none.
@@ -42,6 +43,7 @@ class Overlaps:
         length: from end to end; the sum times the area of a ray is the overlap volume.
     """
 
+    ray: Int[np.ndarray, "N"]
     ends: Int[np.ndarray, "N 2"]
     around: Int[np.ndarray, "N 2"]
     barycentric: Float[np.ndarray, "N 2 3"]
@@ -95,6 +97,7 @@ def find_overlaps(
     thinnest = max(2 * crossings.depth_quantum, _THINNEST * np.ptp(points.depth))
     kept = np.bincount(run, length)[run] > thinnest if len(run) else np.zeros(0, bool)
     return Overlaps(
+        ray=crossings.ray[pair[:, 0]],
         ends=ends,
         around=_around(level, crossings.face, pair[:, 0], levels),
         barycentric=barycentric.reshape(-1, 2, 3),

@@ -1,0 +1,70 @@
+"""The arguments that say which overlaps do not count: groups of faces, and folds."""
+
+from typing import Any
+
+import numpy as np
+from jax.core import Tracer
+
+from spt_jax.rays.exclusions import Exclusions
+from spt_jax.rest_surface import RestSurface
+
+
+def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, num_faces: int) -> Exclusions:
+    """Which overlaps do not count, hashable.
+
+    Raises:
+        TypeError: traced groups, groups that are no whole numbers, folds that is no RestSurface.
+        ValueError: groups or folds of another number of faces; pairs that are no pairs of groups.
+    """
+    if folds is not None and not isinstance(folds, RestSurface):
+        raise TypeError(
+            f"folds must be a RestSurface or None: got {type(folds).__name__}; pass "
+            "body.rest_surface, or RestSurface(rest_vertices, faces)."
+        )
+    if folds is not None and folds.num_faces != num_faces:
+        raise ValueError(
+            f"folds must be the rest surface of these faces: got one of {folds.num_faces} faces "
+            f"for {num_faces}; for several bodies in one mesh take folds.copies(count)."
+        )
+    pairs = _as_pairs(ignore_groups)
+    if face_groups is None:
+        if pairs:
+            raise ValueError(
+                f"ignore_groups must come with face_groups: got {ignore_groups!r} alone; pass the "
+                "group of each triangle, such as body.part_groups."
+            )
+        return Exclusions(rest=folds)
+    if isinstance(face_groups, Tracer):
+        raise TypeError(
+            "face_groups must be known when traced: got a traced array; pass a NumPy array."
+        )
+    groups = np.asarray(face_groups)
+    if not np.issubdtype(groups.dtype, np.integer):
+        raise TypeError(f"face_groups must be whole numbers: got {groups.dtype}; use int32.")
+    if groups.shape != (num_faces,):
+        raise ValueError(
+            f"face_groups must have one number a face, ({num_faces},): got shape {groups.shape}."
+        )
+    present = set(np.unique(groups).tolist())
+    for pair in pairs:
+        missing = [group for group in pair if group not in present]
+        if missing:
+            raise ValueError(
+                f"ignore_groups must name groups of face_groups: got {pair}, and no face is in "
+                f"group {missing[0]}."
+            )
+    if not pairs:
+        return Exclusions(rest=folds)
+    return Exclusions(groups.astype(np.int64).tobytes(), pairs, folds)
+
+
+def _as_pairs(ignore_groups: Any) -> tuple[tuple[int, int], ...]:
+    try:
+        pairs = np.asarray(ignore_groups if len(ignore_groups) else np.zeros((0, 2), int))
+    except (TypeError, ValueError):
+        pairs = np.zeros(0)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.integer):
+        raise ValueError(
+            f"ignore_groups must be pairs of group numbers, ((a, b), ...): got {ignore_groups!r}."
+        )
+    return tuple(sorted({(min(a, b), max(a, b)) for a, b in pairs.tolist()}))

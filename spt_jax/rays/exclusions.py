@@ -1,0 +1,152 @@
+"""Which overlaps count: pairs of groups left out, and folds told from collisions.
+
+Overlaps are decided twice. A region of overlap counts where anywhere along its rim two triangles
+cross that may collide; that settles the folds of skinning, whose sheets meet at a crease. Within a
+region that counts, an interval on a ray counts where its four sheets may collide: the two solids
+that overlap there either cross or lie one in the other, and every end of one must be apart from
+every end of the other. A region that counts although none of its intervals does, counts whole.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from spt_jax.rays.levels import Overlaps
+from spt_jax.rays.sheets import Sheets
+
+# Between parts that no path along the rest surface connects.
+_UNCONNECTED = 1e6
+
+
+class Rest(Protocol):
+    """Distances along a rest surface; `spt_jax.RestSurface` is one."""
+
+    distance: float
+
+    def between_faces(
+        self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "N"]:
+        """Distance along the rest surface between triangles."""
+        ...
+
+    def near(
+        self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"], exact: bool = False
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether it is less than `distance`."""
+        ...
+
+
+class Exclusions(NamedTuple):
+    """What does not count, hashable so that it can be a static option.
+
+    Attributes:
+        groups: each triangle's group, the bytes of an int64 array; None: no groups.
+        ignored: pairs of groups whose overlaps do not count.
+        rest: overlaps of sheets nearer than `rest.distance` along it are folds; None: none are.
+    """
+
+    groups: bytes | None = None
+    ignored: tuple[tuple[int, int], ...] = ()
+    rest: Any = None
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is left out."""
+        return bool(self.groups is not None and self.ignored) or self.rest is not None
+
+
+NOTHING = Exclusions()
+
+
+def counted_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
+    """Which regions of overlap count: those without a rim, and those whose rim has a collision."""
+    f, g = sheets.pairs.T
+    collides = ~_ignored(exclusions, f, g)
+    if exclusions.rest is not None:
+        collides &= ~exclusions.rest.near(f, g, exact=True)
+    region = sheets.region[f]
+    rim = np.bincount(region, minlength=sheets.num_regions)
+    return (rim == 0) | (np.bincount(region, collides, sheets.num_regions) > 0)
+
+
+def counted_intervals(
+    exclusions: Exclusions, sheets: Sheets, beams: list[Overlaps]
+) -> list[Bool[np.ndarray, "N"]]:
+    """Which intervals of each beam count."""
+    allowed = np.append(counted_regions(exclusions, sheets), True)  # -1: in no region
+    regions = [sheets.region[overlaps.ends].max(axis=1, initial=-1) for overlaps in beams]
+    apart = [_apart(exclusions, overlaps) for overlaps in beams]
+    resolved = np.zeros(len(allowed), bool)
+    for region, free in zip(regions, apart, strict=True):
+        resolved[region[free]] = True
+    resolved[-1] = True
+    return [
+        allowed[region] & (free | ~resolved[region])
+        for region, free in zip(regions, apart, strict=True)
+    ]
+
+
+def counted_labels(
+    exclusions: Exclusions, sheets: Sheets, faces: Int[np.ndarray, "F 3"]
+) -> Int[np.ndarray, "V"]:
+    """The vertices' classes sign(w_out), 0 where their region of overlap does not count."""
+    label = np.sign(sheets.winding).astype(np.int8)
+    if exclusions.any:
+        counted = counted_regions(exclusions, sheets)[sheets.region[sheets.faces]]
+        kept = np.zeros(len(label), bool)
+        kept[faces[sheets.faces[counted]]] = True
+        label[~kept] = 0
+    return label
+
+
+def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
+    """Whether the two solids of each interval may collide."""
+    first, last = overlaps.ends.T
+    opening, closing = overlaps.around.T
+    lone = opening < 0  # inside out: only the two ends are there to compare
+    opening, closing = np.where(lone, first, opening), np.where(lone, last, closing)
+    # The solids are (opening, last) and (first, closing) where they cross, and (opening, closing)
+    # and (first, last) where one lies in the other.
+    pairs = {
+        "ol": (opening, last),
+        "fc": (first, closing),
+        "oc": (opening, closing),
+        "fl": (first, last),
+        "of": (opening, first),
+        "cl": (closing, last),
+    }
+    far = {name: ~_ignored(exclusions, *pair) for name, pair in pairs.items()}
+    length = {name: _group_distance(exclusions, *pair) for name, pair in pairs.items()}
+    if exclusions.rest is not None:
+        for name, pair in pairs.items():
+            along = np.minimum(exclusions.rest.between_faces(*pair), _UNCONNECTED)
+            far[name] &= along >= exclusions.rest.distance
+            length[name] = length[name] + along
+    crossing = length["ol"] + length["fc"] <= length["oc"] + length["fl"]
+    apart = far["of"] & far["cl"] & np.where(crossing, far["oc"] & far["fl"], far["ol"] & far["fc"])
+    return np.where(lone, far["fl"], apart)
+
+
+def _ignored(exclusions: Exclusions, f, g) -> Bool[np.ndarray, "N"]:
+    if exclusions.groups is None or not exclusions.ignored:
+        return np.zeros(len(f), bool)
+    groups, ignored = _group_table(exclusions)
+    return ignored[groups[f], groups[g]]
+
+
+def _group_distance(exclusions: Exclusions, f, g) -> Float[np.ndarray, "N"]:
+    if exclusions.groups is None:
+        return np.zeros(len(f))
+    groups, _ = _group_table(exclusions)
+    return 1.0 * (groups[f] != groups[g])
+
+
+def _group_table(exclusions: Exclusions):
+    names, groups = np.unique(np.frombuffer(exclusions.groups, np.int64), return_inverse=True)
+    ignored = np.zeros((len(names), len(names)), bool)
+    for pair in exclusions.ignored:
+        at = np.searchsorted(names, pair)
+        if (at < len(names)).all() and (names[at] == pair).all():
+            ignored[at[0], at[1]] = ignored[at[1], at[0]] = True
+    return groups, ignored

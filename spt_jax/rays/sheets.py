@@ -1,0 +1,82 @@
+"""The sheets of the surface that lie in overlaps, told from the triangles alone, without beams.
+
+Two things make a triangle's class differ from 0 somewhere: one of its corners is within another
+part of the mesh (or inside out), or another triangle passes through it. Both are found exactly, so
+every overlap, however thin, is bounded by the triangles found here.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from spt_jax.rays.pairs import EdgeCrossings, edge_crossings, face_pairs
+from spt_jax.rays.vertex_winding import vertex_winding
+
+# map(function, items); the caller may bring one that uses several threads.
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """Triangles whose surface lies in overlaps, wholly or in part.
+
+    Attributes:
+        winding: w_out at each vertex, the winding number just outside the surface there.
+        crossings: the edges that pass through triangles.
+        pairs: the triangles that pass through each other; the rims of the overlaps run there.
+        faces: the triangles that bound overlaps.
+        num_regions: connected overlaps; sheets are connected within the surface and by `pairs`.
+        region: the number of each triangle's region; -1 outside of `faces`.
+    """
+
+    winding: Int[np.ndarray, "V"]
+    crossings: EdgeCrossings
+    pairs: Int[np.ndarray, "P 2"]
+    faces: Int[np.ndarray, "H"]
+    num_regions: int
+    region: Int[np.ndarray, "F"]
+
+
+def find_sheets(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    directions: Float[np.ndarray, "D 3"],
+    map_tasks: Map = map,
+) -> Sheets:
+    """The triangles that bound overlaps, and how they hang together."""
+    tasks = (
+        (lambda: vertex_winding(vertices, faces, directions)),
+        (lambda: edge_crossings(vertices, faces)),
+    )
+    winding, crossings = map_tasks(lambda task: task(), tasks)
+    pairs = face_pairs(crossings)
+    bounding = (winding != 0)[faces]
+    hot = bounding.any(axis=1)
+    hot[pairs] = True
+    found = np.flatnonzero(hot)
+    num_regions, region = _regions(faces, winding, pairs, found)
+    return Sheets(winding, crossings, pairs, found, num_regions, region)
+
+
+def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
+    # Triangles of one region share a vertex that lies in an overlap, or pass through each other.
+    # Sharing a vertex outside is not enough: two overlaps may meet at one triangle's corner.
+    region = np.full(len(faces), -1)
+    if not len(found):
+        return 0, region
+    corners = faces[found]
+    row, corner = np.nonzero((winding != 0)[corners])
+    node = np.full(len(faces), -1)
+    node[found] = np.arange(len(found))
+    first = np.concatenate([row, node[pairs[:, 0]]])
+    second = np.concatenate([len(found) + corners[row, corner], node[pairs[:, 1]]])
+    size = len(found) + len(winding)
+    links = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(size, size))
+    component = connected_components(links, directed=False)[1][: len(found)]
+    used, region[found] = np.unique(component, return_inverse=True)
+    return len(used), region
