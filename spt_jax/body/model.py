@@ -7,12 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float, Int
 
+from spt_jax.groups import Pairs, neighbour_pairs, part_groups
 from spt_jax.rest_surface import RestSurface
 
 from . import poses
+from .model_check import check_model
 from .rotations import matrix_from_axis_angle
 from .skinning import (
     blend_shapes,
@@ -80,50 +81,7 @@ class BodyModel(eqx.Module):
     pose_basis: Float[Array, "V 3 P"] | None = None
 
     def __check_init__(self):
-        vertices = self.template.shape[0] if self.template.ndim else 0
-        joints = self.joint_template.shape[0] if self.joint_template.ndim else 0
-        coefficients = self.shape_basis.shape[-1] if self.shape_basis.ndim else 0
-        expected = {
-            "template": (vertices, 3),
-            "shape_basis": (vertices, 3, coefficients),
-            "joint_template": (joints, 3),
-            "joint_shape_basis": (joints, 3, coefficients),
-            "weights": (vertices, joints),
-            "pose_basis": (vertices, 3, 9 * (joints - 1)),
-        }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array is None:
-                continue
-            if array.shape != shape:
-                raise ValueError(
-                    f"{name} must have shape {shape} for {vertices} vertices, {joints} joints and "
-                    f"{coefficients} shape coefficients: got {array.shape}."
-                )
-            if not jnp.issubdtype(array.dtype, jnp.floating):
-                raise TypeError(f"{name} must be floating-point: got dtype {array.dtype}.")
-        if self.faces.ndim != 2 or self.faces.shape[1] != 3:
-            raise ValueError(f"faces must be triangles, (F, 3): got shape {self.faces.shape}.")
-        if self.faces.dtype != np.int32:
-            raise TypeError(f"faces must be int32: got {self.faces.dtype}; cast them.")
-        if len(self.parents) != joints or len(self.joint_names) != joints:
-            raise ValueError(
-                f"parents and joint_names must have one entry for each of {joints} joints: got "
-                f"{len(self.parents)} and {len(self.joint_names)}."
-            )
-        for joint, parent in enumerate(self.parents):
-            if (parent != -1) if joint == 0 else not 0 <= parent < joint:
-                raise ValueError(
-                    "parents must be -1 for joint 0 and an earlier joint for every other: got "
-                    f"{parent} for joint {joint} ({self.joint_names[joint]}); reorder the joints."
-                )
-        if not isinstance(self.faces, Tracer) and self.faces.size:
-            low, high = int(np.min(self.faces)), int(np.max(self.faces))
-            if low < 0 or high >= vertices:
-                raise ValueError(
-                    f"faces must index into vertices: got indices {low} to {high} for {vertices} "
-                    "vertices; indices are 0-based."
-                )
+        check_model(self)
 
     @property
     def num_vertices(self) -> int:
@@ -157,6 +115,35 @@ class BodyModel(eqx.Module):
             RestSurface(24540 faces, distance=0.3)
         """
         return RestSurface(self.template, self.faces)
+
+    @property
+    def part_groups(self) -> Int[np.ndarray, "F"]:
+        """Of each face, the joint that moves it most (`joint_names` says which).
+
+        By the mean skinning weight over its corners. With `ignore_groups=body.neighbour_pairs`,
+        overlaps of parts that meet at a joint do not count.
+
+        Raises:
+            TypeError: as `rest_surface`.
+
+        Example:
+            >>> from spt_jax.body import load_body
+            >>> body = load_body()
+            >>> body.joint_names[body.part_groups[body.template[body.faces[:, 0], 1].argmax()]]
+            'head'
+        """
+        return part_groups(self.weights, self.faces)
+
+    @property
+    def neighbour_pairs(self) -> Pairs:
+        """Each part with itself and with its parent's, as pairs of joints for `ignore_groups`.
+
+        Example:
+            >>> from spt_jax.body import load_body
+            >>> (4, 7) in load_body().neighbour_pairs  # left knee, left ankle
+            True
+        """
+        return neighbour_pairs(self.parents)
 
     def __call__(
         self,
