@@ -1,21 +1,28 @@
 """Which edges of a mesh pass through which of its triangles: every place where it cuts itself.
 
-Triangles are gathered into clusters of neighbours; clusters whose boxes meet give pairs of
-triangles whose boxes meet, and of those the few whose planes part each other's corners are
-decided by signed volumes.
+Triangles that share a vertex are told apart by that vertex: if the triangles around it, seen
+along some direction, lie side by side, none of them meets another. That holds nearly everywhere,
+and is proved for all vertices at once; only where it is not are these pairs examined. Triangles
+that share no vertex are found by boxes: of clusters of neighbours, then of the triangles in them.
+What is left is decided by signed volumes.
 """
 
-import hashlib
-import threading
-from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-_CLUSTER = 16
+from spt_jax.rays.pair_layout import CLUSTER, Layout, Topology, prepared
+
 # Candidates handled at once: bounds the memory at some tens of megabytes for any mesh.
 _CHUNK = 1 << 18
+# A coordinate of a box takes 20 bits and a guard bit: three to a word, six tests to two words.
+_FIELD = 21
+_STEPS = (1 << (_FIELD - 1)) - 1
+_GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
+# Relative to the size of what is multiplied, far above float64's rounding.
+_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
@@ -43,55 +50,41 @@ def edge_crossings(
     among: Bool[np.ndarray, "F"] | None = None,
 ) -> EdgeCrossings:
     """Every edge that passes through a triangle with which it shares no vertex."""
+    nothing = np.zeros(0, np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        return _crossings_of(
-            vertices,
-            np.zeros((0, 2), np.int64),
-            np.zeros((0, 2), np.int64),
-            np.zeros(0, np.int64),
-            np.zeros((0, 3)),
+        return EdgeCrossings(
+            nothing.reshape(0, 2), nothing.reshape(0, 2), nothing, np.zeros((0, 3))
         )
-    topology = _topology_of(faces)
-    _, exponent = np.frexp(np.abs(vertices[faces]).max())
-    points = np.ldexp(vertices.astype(np.float64), -int(exponent))
-    corner = points[faces]
-    low, high = corner.min(axis=1), corner.max(axis=1)
-    order = _along_curve(low + high)
-    start = np.arange(0, len(faces), _CLUSTER)
-    size = np.diff(np.append(start, len(faces)))
-    box_low = np.minimum.reduceat(low[order], start)
-    box_high = np.maximum.reduceat(high[order], start)
-    marked = None if among is None else np.logical_or.reduceat(among[order], start)
-    found_edge, found_face, found_part = [], [], []
-    for a, b in _meeting(box_low, box_high):
-        if marked is not None:
+    mesh = prepared(faces, len(vertices))
+    topology = mesh.topology
+    # A power of two, so that nothing is rounded: products of three lengths stay in range.
+    _, exponent = np.frexp(np.abs(vertices).max())
+    points = np.ldexp(vertices.T.astype(np.float64, order="C"), -int(exponent))
+    layout = mesh.layout or mesh.arrange(_face_boxes(points, topology.faces))
+    shape = _shape(points, layout)
+    touching = None if among is None else _touching(topology, among)
+    found = list(_around_vertices(points, topology, layout, shape))
+    clusters = _clusters(shape)
+    for a, b in _meeting_clusters(clusters):
+        if touching is not None:
+            marked = touching[layout.face].reshape(-1, CLUSTER).any(axis=1)
             kept = marked[a] | marked[b]
             a, b = a[kept], b[kept]
-        for k in range(0, len(a), _CHUNK // _CLUSTER):
-            t, u = _triangle_pairs(
-                a[k : k + _CHUNK // _CLUSTER],
-                b[k : k + _CHUNK // _CLUSTER],
-                order,
-                start,
-                size,
-                low,
-                high,
-                box_low,
-                box_high,
-            )
-            if among is not None:
-                kept = among[t] | among[u]
+        for t, u in _meeting_triangles(layout, shape, clusters, a, b):
+            if touching is not None:
+                kept = touching[layout.face[t]] | touching[layout.face[u]]
                 t, u = t[kept], u[kept]
-            edge, face, part = _decide(points, faces, topology, t, u)
-            found_edge.append(edge)
-            found_face.append(face)
-            found_part.append(part)
-    edge, face, part = map(np.concatenate, (found_edge, found_face, found_part))
-    order = np.lexsort((face, edge))
-    edge, face, part = edge[order], face[order], part[order]
-    ends = topology.ends[edge]
+            found.append(_edges_of_pairs(topology, layout, shape, t, u))
+    row, slot = (np.concatenate(part) for part in zip(*found, strict=True))
+    row, face, part = _decide(points, topology, row, layout.face[slot])
+    if among is not None:
+        kept = _edges_of(topology, among)[topology.edge_id[row]] | among[face]
+        row, face, part = row[kept], face[kept], part[kept]
+    order = np.lexsort((face, row))
+    row, face, part = row[order], face[order], part[order]
+    ends = topology.ends[row]
     p, q = vertices[ends[:, 0]], vertices[ends[:, 1]]
-    return EdgeCrossings(ends, topology.edge_faces[edge], face, p + part[:, None] * (q - p))
+    return EdgeCrossings(ends, topology.edge_faces[row], face, p + part[:, None] * (q - p))
 
 
 def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
@@ -103,130 +96,275 @@ def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
     return np.unique(np.sort(pair, axis=1), axis=0)
 
 
-def _crossings_of(vertices, ends, edge_faces, face, point):
-    return EdgeCrossings(ends, edge_faces, face, point)
+def _edges_of(topology: Topology, among):
+    """Which edges belong to a marked face, by their numbers."""
+    first, second = topology.edge_faces.T
+    marked = among[first] | ((second >= 0) & among[second])
+    return np.bincount(topology.edge_id, marked) > 0
+
+
+def _touching(topology: Topology, among):
+    """The marked faces and those that share an edge with one."""
+    marked = _edges_of(topology, among)[topology.edge_id]
+    touching = among.copy()
+    for side in topology.edge_faces.T:
+        touching[side[marked & (side >= 0)]] = True
+    return touching
 
 
 @dataclass(frozen=True)
-class _Topology:
-    ends: np.ndarray
-    edge_faces: np.ndarray
-    owned: np.ndarray  # (F, 3): edge at corners k, k + 1 that this face answers for, or -1
+class _Boxes:
+    """Boxes as whole numbers (3, C), and as words."""
+
+    low: Int[np.ndarray, "3 C"]
+    high: Int[np.ndarray, "3 C"]
+    low_word: Int[np.ndarray, "C"]
+    high_word: Int[np.ndarray, "C"]
 
 
-_kept: OrderedDict = OrderedDict()
-_lock = threading.Lock()
+@dataclass(frozen=True)
+class _Shape:
+    """The triangles in their slots: corners, area normals, boxes as whole numbers and as words."""
+
+    corner: Float[np.ndarray, "3 3 S"]  # axis, corner, slot
+    normal: Float[np.ndarray, "3 S"]
+    extent: Float[np.ndarray, "S"]
+    low: Int[np.ndarray, "3 S"]
+    high: Int[np.ndarray, "3 S"]
+    low_word: Int[np.ndarray, "S"]
+    high_word: Int[np.ndarray, "S"]
 
 
-def _topology_of(faces) -> _Topology:
-    faces = np.ascontiguousarray(faces)
-    key = (faces.shape, faces.dtype.str, hashlib.blake2b(faces, digest_size=16).digest())
-    with _lock:
-        found = _kept.get(key)
-        if found is not None:
-            _kept.move_to_end(key)
-            return found
-    found = _build(faces.astype(np.int64))
-    with _lock:
-        _kept[key] = found
-        while len(_kept) > 4:
-            _kept.popitem(last=False)
-    return found
+def _face_boxes(points, faces):
+    corner = points[:, faces]
+    return np.concatenate([corner.min(axis=2), corner.max(axis=2)]).T
 
 
-def _build(faces) -> _Topology:
-    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    low, high = np.minimum(tail, head), np.maximum(tail, head)
-    half = np.lexsort((high, low))
-    low, high = low[half], high[half]
-    new = np.append(True, (low[1:] != low[:-1]) | (high[1:] != high[:-1]))
-    rank = np.arange(len(half)) - np.maximum.accumulate(np.where(new, np.arange(len(half)), 0))
-    first = np.flatnonzero(rank % 2 == 0)
-    ends = np.stack([low[first], high[first]], axis=1)
-    second = np.minimum(first + 1, len(half) - 1)
-    has_second = (rank[second] % 2 == 1) & (first + 1 < len(half))
-    edge_faces = np.stack([half[first] // 3, np.where(has_second, half[second] // 3, -1)], axis=1)
-    owned = np.full(faces.size, -1)
-    owned[half[first]] = np.arange(len(first))
-    return _Topology(ends, edge_faces, owned.reshape(faces.shape))
+def _shape(points, layout: Layout) -> _Shape:
+    corner = points.take(layout.corners, axis=1)
+    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+    u, v = b - a, c - a
+    normal = np.empty_like(a)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        normal[k] = u[i] * v[j]
+        normal[k] -= u[j] * v[i]
+    normal[:, layout.empty] = 0.0
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    extent = (high - low).sum(axis=0)
+    base = low.min(axis=1, keepdims=True)
+    span = float((high - base).max())
+    scale = _STEPS / span if span > 0 else 0.0
+    # Rounding down keeps the order of any two coordinates, so boxes that meet still do.
+    low = ((low - base) * scale).astype(np.int64)
+    high = ((high - base) * scale).astype(np.int64)
+    low[:, layout.empty] = _STEPS
+    high[:, layout.empty] = 0
+    return _Shape(corner, normal, extent, low, high, _word(low), _word(high) | _GUARDS)
 
 
-def _along_curve(center):
-    center = center - center.min(axis=0)
-    extent = center.max()
-    cell = (center * (1023 / extent if extent > 0 else 0.0)).astype(np.int64)
-    for shift in (16, 8, 4, 2):
-        mask = {16: 0x30000FF, 8: 0x300F00F, 4: 0x30C30C3, 2: 0x9249249}[shift]
-        cell = (cell | (cell << shift)) & mask
-    return np.argsort(cell[:, 0] | (cell[:, 1] << 1) | (cell[:, 2] << 2), kind="stable")
+def _word(field):
+    return (((field[0] << _FIELD) | field[1]) << _FIELD) | field[2]
 
 
-def _meeting(low, high):
-    """Pairs a <= b (in some order) of boxes that meet, each with itself too, in chunks."""
-    axis = int(np.argmax(np.ptp(low + high, axis=0)))
-    order = np.argsort(low[:, axis])
-    first = low[order, axis]
-    stop = np.searchsorted(first, high[order, axis], side="right")
-    count = stop - np.arange(len(order))
-    total = np.cumsum(count)
-    begin = 0
-    while begin < len(order):
-        done = total[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(total, done + 4 * _CHUNK)))
-        a = np.repeat(np.arange(begin, end), count[begin:end])
-        b = a + np.arange(len(a)) - (total[begin:end] - count[begin:end] - done)[a - begin]
-        a, b = order[a], order[b]
-        for k in range(3):
-            if k != axis:
-                kept = (low[a, k] <= high[b, k]) & (low[b, k] <= high[a, k])
-                a, b = a[kept], b[kept]
-        yield a, b
-        begin = end
+def _meet(low, high, other_low, other_high):
+    """Whether boxes meet: a guard bit survives where the high end is not below the low one."""
+    first = high - other_low
+    first &= other_high - low
+    first &= _GUARDS
+    return first == _GUARDS
 
 
-def _triangle_pairs(a, b, order, start, size, low, high, box_low, box_high):
-    def reach(mine, other):
-        pair = np.repeat(np.arange(len(mine)), size[mine])
-        step = np.arange(len(pair)) - (np.cumsum(size[mine]) - size[mine])[pair]
-        t = order[start[mine][pair] + step]
-        o = other[pair]
-        kept = ((low[t] <= box_high[o]) & (box_low[o] <= high[t])).all(axis=1)
-        return pair[kept], t[kept]
+def _around_vertices(points, topology: Topology, layout: Layout, shape: _Shape):
+    """Candidates (row, slot) whose triangles share the one vertex that is not on the edge."""
+    vertex = _uncertain(points, topology, layout, shape)
+    corner, at = _spread(topology.fan_start[vertex], np.diff(topology.fan_start)[vertex])
+    corner, vertex = topology.fan[corner], vertex[at]
+    row = topology.opposite.ravel()[corner]
+    kept = np.flatnonzero(row >= 0)
+    row, vertex = row[kept], vertex[kept]
+    first, count = topology.fan_start[vertex], np.diff(topology.fan_start)[vertex]
+    for part in _parts(count):
+        other, at = _spread(first[part], count[part])
+        edge, face = row[part][at], topology.fan[other] // 3
+        kept = np.flatnonzero(_apart(topology, edge, face))
+        edge, slot = edge[kept], layout.slot[face[kept]]
+        ends = np.stack([points.take(x, axis=1) for x in topology.ends[edge].T], axis=1)
+        extent = np.abs(ends[:, 1] - ends[:, 0]).sum(axis=0)
+        kept = np.flatnonzero(_straddles(shape, ends, extent, slot))
+        yield edge[kept], slot[kept]
 
-    pair_t, t = reach(a, b)
-    pair_u, u = reach(b, a)
-    count = np.bincount(pair_u, minlength=len(a))
-    first = np.cumsum(count) - count
-    each = np.repeat(np.arange(len(t)), count[pair_t])
-    step = np.arange(len(each)) - (np.cumsum(count[pair_t]) - count[pair_t])[each]
-    t, u = t[each], u[first[pair_t][each] + step]
-    own = (a == b)[pair_t[each]]
-    kept = ((low[t] <= high[u]) & (low[u] <= high[t])).all(axis=1) & (~own | (t < u))
-    return t[kept], u[kept]
+
+def _apart(topology: Topology, row, face):
+    ends, corner = topology.ends[row], topology.faces[face]
+    return (ends[:, :, None] != corner[:, None, :]).all(axis=(1, 2))
 
 
-def _decide(points, faces, topology, t, u):
-    edge = np.concatenate([topology.owned[t], topology.owned[u]]).ravel()
-    face = np.repeat(np.concatenate([u, t]), 3)
-    kept = edge >= 0
-    edge, face = edge[kept], face[kept]
-    ends = topology.ends[edge]
-    corner = np.sort(faces[face], axis=1)
-    kept = (ends[:, :, None] != corner[:, None, :]).all(axis=(1, 2))
-    edge, face, ends, corner = edge[kept], face[kept], ends[kept], corner[kept]
-    p, q = points[ends[:, 0]], points[ends[:, 1]]
-    a, b, c = points[corner[:, 0]], points[corner[:, 1]], points[corner[:, 2]]
-    normal = np.cross(b - a, c - a)
-    of_p = np.einsum("ij,ij->i", normal, p - a)
-    of_q = np.einsum("ij,ij->i", normal, q - a)
+def _uncertain(points, topology: Topology, layout: Layout, shape: _Shape):
+    """Vertices around which triangles have not been shown to lie side by side.
+
+    Let the triangles around a vertex all face a direction d with d_k = 0. Seen along d they turn
+    around the vertex in one sense, once for every two of them that lie across the plane of
+    constant x_k: once in all exactly if the vertex is the median of x_k in two of its triangles.
+    Then they do not overlap. Ties of x_k are broken by vertex number, as if moved by nothing.
+    """
+    count = points.shape[1]
+    flat = layout.corners.ravel()
+    d = np.stack([np.bincount(flat, np.tile(n, 3), count) for n in shape.normal])
+    axis = np.abs(d).argmin(axis=0)
+    every = np.arange(count)
+    d[axis, every] = 0.0
+    length = np.abs(d).sum(axis=0)
+    d /= np.where(length > 0, length, 1.0)
+    at = d.take(layout.corners, axis=1)
+    facing = at[0] * shape.normal[0]
+    facing += at[1] * shape.normal[1]
+    facing += at[2] * shape.normal[2]
+    away = facing <= _ROUNDING * shape.extent * shape.extent
+    away[:, layout.empty] = False
+    medians = np.stack([_medians(x, layout, count) for x in shape.corner])
+    sure = topology.closed & (medians[axis, every] == 2)
+    sure[layout.corners[away]] = False
+    return np.flatnonzero(~sure)
+
+
+def _medians(x, layout: Layout, count):
+    """In how many of its triangles each vertex has the coordinate between the two others."""
+    turned = x[1], x[2], x[0]
+    rises = [
+        (p < q) | ((p == q) & up) for p, q, up in zip(x, turned, layout.ascending, strict=True)
+    ]
+    a, b, c = layout.corners
+    median = np.where(rises[0] == rises[1], b, np.where(rises[1] == rises[2], c, a))
+    median[layout.empty] = count
+    return np.bincount(median, minlength=count + 1)[:-1]
+
+
+def _clusters(shape: _Shape):
+    low, high = shape.low, shape.high
+    while low.shape[1] > shape.low.shape[1] // CLUSTER:
+        low = np.minimum(low[:, ::2], low[:, 1::2])
+        high = np.maximum(high[:, ::2], high[:, 1::2])
+    return _Boxes(low, high, _word(low), _word(high) | _GUARDS)
+
+
+def _meeting_clusters(boxes: _Boxes):
+    """Pairs of boxes that meet, each with itself too, in parts of bounded size."""
+    axis = int(np.argmax(np.ptp(boxes.low, axis=1)))
+    order = np.argsort(boxes.low[axis])
+    first = boxes.low[axis][order]
+    low, high = boxes.low_word[order], boxes.high_word[order]
+    here = np.arange(len(order))
+    stop = np.searchsorted(first, boxes.high[axis][order], side="right")
+    count = np.maximum(stop - here, 1)
+    for part in _parts(count):
+        b, at = _spread(here[part], count[part])
+        a = at + part.start
+        kept = np.flatnonzero(_meet(low[a], high[a], low[b], high[b]))
+        yield order[a[kept]], order[b[kept]]
+
+
+def _meeting_triangles(layout: Layout, shape: _Shape, boxes: _Boxes, a, b):
+    """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
+    own = a == b
+    low, high = shape.low_word.reshape(-1, CLUSTER), shape.high_word.reshape(-1, CLUSTER)
+    a, b, c = a[~own], b[~own], a[own]
+    for part in _parts(np.full(len(c), CLUSTER * CLUSTER)):
+        x, y = low[c[part]], high[c[part]]
+        meet = layout.apart[c[part]]
+        meet &= _meet(x[:, :, None], y[:, :, None], x[:, None, :], y[:, None, :])
+        found = np.flatnonzero(meet)
+        cluster, pair = np.divmod(found, CLUSTER * CLUSTER)
+        cluster = CLUSTER * c[part][cluster]
+        yield cluster + pair // CLUSTER, cluster + pair % CLUSTER
+    for part in _parts(np.full(len(a), 2 * CLUSTER)):
+        pair_t, t = _reaching(low, high, boxes, a[part], b[part])
+        pair_u, u = _reaching(low, high, boxes, b[part], a[part])
+        count = np.bincount(pair_u, minlength=len(a[part]))
+        first = (np.cumsum(count) - count)[pair_t]
+        count = count[pair_t]
+        for piece in _parts(count):
+            second, at = _spread(first[piece], count[piece])
+            f, g = t[piece][at], u[second]
+            kept = np.flatnonzero(
+                _meet(shape.low_word[f], shape.high_word[f], shape.low_word[g], shape.high_word[g])
+            )
+            f, g = f[kept], g[kept]
+            shared = np.zeros(len(f), bool)
+            p, q = layout.corners.take(f, axis=1), layout.corners.take(g, axis=1)
+            for i in range(3):
+                for j in range(3):
+                    shared |= p[i] == q[j]
+            kept = np.flatnonzero(~shared)
+            yield f[kept], g[kept]
+
+
+def _reaching(low, high, boxes: _Boxes, a, b):
+    """The triangles of cluster a whose boxes meet the box of b: number of the pair, and slot."""
+    meet = _meet(low[a], high[a], boxes.low_word[b][:, None], boxes.high_word[b][:, None])
+    found = np.flatnonzero(meet)
+    pair = found // CLUSTER
+    return pair, found + CLUSTER * (a[pair] - pair)
+
+
+def _edges_of_pairs(topology: Topology, layout: Layout, shape: _Shape, t, u):
+    """Candidates (row, slot) of pairs of triangles that neither's plane keeps apart."""
+    for turn in (0, 1):
+        x, y = (t, u) if turn else (u, t)
+        kept = np.flatnonzero(_straddles(shape, shape.corner.take(x, axis=2), shape.extent[x], y))
+        t, u = t[kept], u[kept]
+    row = topology.opposite[layout.face[np.concatenate([t, u])]].ravel()
+    slot = np.repeat(np.concatenate([u, t]), 3)
+    kept = np.flatnonzero(row >= 0)
+    return row[kept], slot[kept]
+
+
+def _straddles(shape: _Shape, points, extent, slot):
+    """Whether points (3, N, M) lie on both sides of the planes of M triangles, or may."""
+    normal, corner = shape.normal.take(slot, axis=1), shape.corner[:, 0].take(slot, axis=1)
+    height = normal[0] * (points[0] - corner[0])
+    height += normal[1] * (points[1] - corner[1])
+    height += normal[2] * (points[2] - corner[2])
+    own = shape.extent[slot]
+    margin = _ROUNDING * own * own * (own + extent)
+    return (height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin)
+
+
+def _decide(points, topology: Topology, row, face):
+    """The candidates that cross, and what part of the edge lies before the crossing.
+
+    Every sign is computed from the same numbers in the same order for all who ask for it: on
+    which side of a triangle a vertex lies, and on which side of each other two edges pass. So an
+    edge that leaves one triangle for the next across their common edge passes through exactly
+    one of them, whatever the rounding; touching counts as lying on the positive side.
+    """
+    corner = np.sort(topology.faces[face], axis=1).T
+    a, b, c = (points.take(x, axis=1) for x in corner)
+    p, q = (points.take(x, axis=1) for x in topology.ends[row].T)
+    normal = np.cross(b - a, c - a, axis=0)
+    of_p, of_q = _dot(normal, p - a), _dot(normal, q - a)
+    sides = [_dot(np.cross(q - p, x - p, axis=0), y - p) >= 0 for x, y in ((a, b), (b, c), (a, c))]
     kept = (of_p >= 0) != (of_q >= 0)
-    edge, face, p, q, a, b, c = (x[kept] for x in (edge, face, p, q, a, b, c))
-    of_p, of_q = of_p[kept], of_q[kept]
-    side = [_side(p, q, x, y) for x, y in ((a, b), (b, c), (a, c))]
-    kept = (side[0] == side[1]) & (side[0] != side[2])
-    return edge[kept], face[kept], (of_p / (of_p - of_q))[kept]
+    kept &= (sides[0] == sides[1]) & (sides[0] != sides[2])
+    kept = np.flatnonzero(kept)
+    return row[kept], face[kept], of_p[kept] / (of_p[kept] - of_q[kept])
 
 
-def _side(p, q, a, b):
-    """Whether line a-b passes line p-q on its one side; both in their canonical direction."""
-    return np.einsum("ij,ij->i", np.cross(q - p, a - p), b - p) >= 0
+def _dot(x, y):
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+def _spread(first, count):
+    """first[i], first[i] + 1, ... (count[i] of them) for each i in turn; and the i of each."""
+    at = np.repeat(np.arange(len(count)), count)
+    return np.arange(len(at)) + (first - np.cumsum(count) + count)[at], at
+
+
+def _parts(count) -> Iterator[slice]:
+    """Slices of the items, such that each slice's counts add up to about `_CHUNK` at most."""
+    total = np.cumsum(count)
+    begin, done = 0, 0
+    while begin < len(total):
+        end = max(begin + 1, int(np.searchsorted(total, done + _CHUNK, side="right")))
+        yield slice(begin, end)
+        begin, done = end, int(total[end - 1])
