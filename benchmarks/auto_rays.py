@@ -1,14 +1,15 @@
 """How well and how fast `rays="auto"` measures real bodies: `python -m benchmarks.auto_rays`.
 
-The reference is a beam of 4096 x 4096 rays in each of three directions, some 10 s a frame; it is
-kept in a cache file, so that only the first run waits for it.
+Two references: 4096 x 4096 rays in each of three directions, some 10 s a frame, and the exact
+overlap of the triangles (`references.py`), which tells how far off those rays are themselves. Both
+are kept in cache files, so that only the first run waits for them.
 """
 
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,18 +19,14 @@ from jaxtyping import Float, Int
 
 from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.oracles import crossing_pairs, edges_of
+from benchmarks.references import REFERENCE_RAYS, Kept, Rays, Reference, by_rays, exact, sampling
 from spt_jax import load_body, load_mocap
-from spt_jax.arguments import as_directions
-from spt_jax.output_files import atomic_write
 from spt_jax.rays import measure
 
-REFERENCE_RAYS = 4096
 PLAIN_RAYS = 512  # whose cost is the unit
 VOLUME_WITHIN, VOLUME_FLOOR, GRADIENT_WITHIN = 5e-3, 1e-9, 2e-2
 POSE_DIRECTIONS = 20
 REPEATS = 3
-
-Rays = int | Literal["auto"]
 
 
 @dataclass
@@ -40,14 +37,10 @@ class Settings:
     seed: int = 0
     rays: tuple[Rays, ...] = ("auto",)
     cache: Path = Path(tempfile.gettempdir()) / "spt_jax_reference_4096.npz"
-    """Where references are kept between runs, by frame name; remove it when the rays change."""
+    """Where references are kept between runs, by frame name; the exact ones lie beside it, under
+    the same name with _exact. Remove both when the body or its poses change."""
     record: bool = False
     """Write the tables into results.md."""
-
-
-def sampling(rays: Rays) -> measure.Sampling:
-    """So many rays in each of three directions."""
-    return measure.Sampling(rays, as_directions(3))
 
 
 class Bodies:
@@ -101,53 +94,14 @@ def overlapping_frames(bodies: Bodies, count: int, seed: int) -> list[int]:
     return chosen[:count]
 
 
-class Reference(NamedTuple):
-    """What 4096 x 4096 rays find: a volume for each direction, and the boundary gradient."""
-
-    volumes: Float[np.ndarray, "3"]
-    gradient: Float[np.ndarray, "V 3"]
-
-
-class References:
-    """References by frame name, kept in an .npz file."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._found: dict[str, np.ndarray] = {}
-        if file.exists():
-            with np.load(file, allow_pickle=False) as stored:
-                self._found = {key: stored[key] for key in stored.files}
-
-    def has(self, name: str) -> bool:
-        """Whether the frame needs no computing."""
-        return f"{name} volumes" in self._found
-
-    def of(
-        self,
-        name: str,
-        vertices: Float[np.ndarray, "V 3"],
-        faces: Int[np.ndarray, "F 3"],
-    ) -> Reference:
-        """The frame's reference, from the file or computed and added to it."""
-        if not self.has(name):
-            found = measure.measure(vertices, faces, sampling(REFERENCE_RAYS))
-            gradient = found.gradient("boundary", "vertex")
-            self._found[f"{name} volumes"] = np.array([beam.volume for beam in found.beams])
-            # float32 halves a file of 30 MB and is 1e-7 off, where 2e-2 is to be told.
-            self._found[f"{name} gradient"] = gradient.astype(np.float32)
-            with atomic_write(self.file) as temporary, temporary.open("wb") as file:
-                np.savez(file, allow_pickle=False, **self._found)
-        return Reference(
-            self._found[f"{name} volumes"], self._found[f"{name} gradient"].astype(np.float64)
-        )
-
-
 class Figures(NamedTuple):
     """One frame against its reference, and against plain rays; times in units of plain rays'."""
 
     volume: float
     error: float
     gradient: float
+    exact_error: float
+    exact_gradient: float
     cost: float
     cost_with_gradient: float
     seconds: float
@@ -165,7 +119,20 @@ def measured(
     return volume, gradient, np.array([halfway - start, time.perf_counter() - start])
 
 
-def compared(bodies: Bodies, frame: int, rays: Rays, reference: Reference, seed: int) -> Figures:
+def gradient_error(
+    velocities: Float[np.ndarray, "K V 3"],
+    gradient: Float[np.ndarray, "V 3"],
+    reference: Float[np.ndarray, "V 3"],
+) -> float:
+    """Of the derivatives in the pose directions: |difference| / |reference|."""
+    expected = np.einsum("kvi,vi->k", velocities, reference)
+    off = np.einsum("kvi,vi->k", velocities, gradient - reference)
+    return float(np.linalg.norm(off) / max(np.linalg.norm(expected), np.finfo(float).tiny))
+
+
+def compared(
+    bodies: Bodies, frame: int, rays: Rays, reference: Reference, truth: Reference, seed: int
+) -> Figures:
     """One frame with the rays in question, timed in turns with plain rays."""
     vertices, velocities = bodies.vertices(frame), bodies.velocities(frame, seed)
     volume, gradient, _ = measured(vertices, bodies.faces, rays)  # also warms the caches
@@ -178,95 +145,154 @@ def compared(bodies: Bodies, frame: int, rays: Rays, reference: Reference, seed:
     # The least of the repeats: other programs can only make one longer.
     fastest = seconds.min(axis=0)
     cost, cost_with_gradient = fastest[0] / fastest[1]
-    expected = np.einsum("kvi,vi->k", velocities, reference.gradient)
-    off = np.einsum("kvi,vi->k", velocities, gradient - reference.gradient)
-    error = float(np.linalg.norm(off) / max(np.linalg.norm(expected), np.finfo(float).tiny))
-    volume_error = volume - reference.volumes.mean()
-    return Figures(volume, volume_error, error, cost, cost_with_gradient, fastest[0, 1])
+    return Figures(
+        volume,
+        volume - reference.volume,
+        gradient_error(velocities, gradient, reference.gradient),
+        volume - truth.volume,
+        gradient_error(velocities, gradient, truth.gradient),
+        cost,
+        cost_with_gradient,
+        fastest[0, 1],
+    )
 
 
 def tables(
-    rays: Rays, figures: list[Figures], references: Float[np.ndarray, "N"], names: list[str]
+    rays: Rays,
+    figures: list[Figures],
+    references: list[Reference],
+    truths: list[Reference],
+    names: list[str],
 ) -> list[Table]:
     """The spread of the errors and costs, and the frames that fall short."""
-    volume, error, gradient, cost, cost_both, seconds = np.array(figures).T
-    relative = np.abs(error) / np.maximum(references, np.finfo(float).tiny)
-    good = (relative <= VOLUME_WITHIN) | (np.abs(error) <= VOLUME_FLOOR)
-    steep = gradient <= GRADIENT_WITHIN
-    within = (
-        f"{good.sum()} of {len(good)} (or within {VOLUME_FLOOR:g} m^3)",
-        "",
-        f"{steep.sum()} of {len(steep)}",
-        "",
-        f"{np.sum(cost_both <= 1)} of {len(cost_both)}",
-        "",
+    columns = Figures(*np.array(figures).T)
+    volume, gradient, cost = columns.volume, columns.gradient, columns.cost_with_gradient
+    sizes = np.array([reference.volume for reference in references])
+    relative = relative_to(columns.error, sizes)
+    exactly = relative_to(columns.exact_error, np.array([truth.volume for truth in truths]))
+    good, exactly_good = (
+        (part <= VOLUME_WITHIN) | (np.abs(error) <= VOLUME_FLOOR)
+        for part, error in ((relative, columns.error), (exactly, columns.exact_error))
     )
+    steep = gradient <= GRADIENT_WITHIN
+    volume_target = f"{VOLUME_WITHIN:.1%} or {VOLUME_FLOOR:g} m^3"
     lines = (
-        (f"volume error, % (target {VOLUME_WITHIN:.1%})", 100 * relative),
-        ("volume error, m^3", np.abs(error)),
-        (f"gradient error, % (target {GRADIENT_WITHIN:.0%})", 100 * gradient),
-        (f"cost of the volume against {PLAIN_RAYS} x {PLAIN_RAYS}", cost),
-        ("cost of volume and gradient against the same (target 1)", cost_both),
-        ("milliseconds for both", 1e3 * seconds),
+        ("volume error, %", 100 * relative, volume_target, good),
+        ("volume error, m^3", np.abs(columns.error), "", None),
+        ("gradient error, %", 100 * gradient, f"{GRADIENT_WITHIN:.0%}", steep),
+        ("volume error against the exact one, %", 100 * exactly, volume_target, exactly_good),
+        (
+            "gradient error against the exact one, %",
+            100 * columns.exact_gradient,
+            f"{GRADIENT_WITHIN:.0%}",
+            columns.exact_gradient <= GRADIENT_WITHIN,
+        ),
+        (f"cost of the volume, {PLAIN_RAYS} x {PLAIN_RAYS} being 1", columns.cost, "", None),
+        ("cost of volume and gradient, likewise", cost, "median 1", cost <= 1),
+        ("milliseconds for both", 1e3 * columns.seconds, "", None),
     )
     spread = Table(
         f'rays="{rays}"' if rays == "auto" else f"rays={rays}",
-        ("figure", "median", "90 %", "maximum", "frames within the target"),
+        ("figure", "median", "90 %", "maximum", "target", "frames within"),
         [
-            (name, *(f"{x:.3g}" for x in np.percentile(values, [50, 90, 100])), target)
-            for (name, values), target in zip(lines, within, strict=True)
+            (
+                name,
+                *(f"{x:.3g}" for x in np.percentile(values, [50, 90, 100])),
+                target,
+                "" if within is None else f"{within.sum()} of {len(within)}",
+            )
+            for name, values, target, within in lines
         ],
     )
     short = sorted(np.flatnonzero(~good | ~steep), key=lambda k: -relative[k])
     exceptions = Table(
         f"Frames that fall short with rays={rays}",
-        ("frame", "reference, m^3", "volume, m^3", "volume error, %", "gradient error, %", "cost"),
+        (
+            "frame",
+            "reference, m^3",
+            "volume, m^3",
+            "volume error, %",
+            "gradient error, %",
+            "against the exact one, %",
+            "cost",
+        ),
         [
             (
                 names[k],
-                f"{references[k]:.4g}",
+                f"{sizes[k]:.4g}",
                 f"{volume[k]:.4g}",
                 f"{100 * relative[k]:.3g}",
                 f"{100 * gradient[k]:.3g}",
-                f"{cost_both[k]:.2f}",
+                f"{100 * columns.exact_gradient[k]:.3g}",
+                f"{cost[k]:.2f}",
             )
             for k in short
         ],
     )
-    return [spread, exceptions]
+    return [spread, exceptions] if len(short) else [spread]
+
+
+def relative_to(error: Float[np.ndarray, "N"], size: Float[np.ndarray, "N"]):
+    """|error| / size."""
+    return np.abs(error) / np.maximum(size, np.finfo(float).tiny)
+
+
+def introduction(
+    bodies: Bodies,
+    frames: list[int],
+    references: list[Reference],
+    truths: list[Reference],
+    settings: Settings,
+) -> str:
+    """What was measured, and how good the reference is itself."""
+    off = [
+        gradient_error(bodies.velocities(frame, settings.seed), coarse.gradient, fine.gradient)
+        for frame, coarse, fine in zip(frames, references, truths, strict=True)
+    ]
+    volume_off = [
+        abs(coarse.volume / fine.volume - 1)
+        for coarse, fine in zip(references, truths, strict=True)
+    ]
+    return (
+        f"{len(frames)} mocap frames that cross themselves, of every motion. Reference: the mean "
+        f"of three directions at {REFERENCE_RAYS} x {REFERENCE_RAYS} rays; its volume is "
+        f"{100 * np.median(volume_off):.2g} % off the exact one in the median and "
+        f"{100 * np.max(volume_off):.2g} % at most, its gradient {100 * np.median(off):.2g} % and "
+        f"{100 * np.max(off):.2g} %. Gradients are projected on {POSE_DIRECTIONS} random pose "
+        "directions; the error is the norm of the difference over the norm of the reference. A "
+        f"cost is the ratio to the plain beams' time in the same process, the least of {REPEATS} "
+        "alternating runs of each."
+    )
 
 
 def main(settings: Settings) -> None:
     bodies = Bodies()
     frames = overlapping_frames(bodies, settings.frames, settings.seed)
     names = [bodies.mocap.names[frame] for frame in frames]
-    store = References(settings.cache)
-    references = []
+    truths_file = settings.cache.with_stem(settings.cache.stem + "_exact")
+    kept = {"exact": Kept(truths_file, exact), "by rays": Kept(settings.cache, by_rays)}
+    found: dict[str, list[Reference]] = {}
     with progress() as bar:
-        for frame, name in zip(bar.track(frames, description="reference"), names, strict=True):
-            if not store.has(name):
-                print(f"reference of {name}, {len(references) + 1} of {len(frames)}", flush=True)
-            references.append(store.of(name, bodies.vertices(frame), bodies.faces))
-    volumes = np.array([found.volumes.mean() for found in references])
-    apart = [np.ptp(found.volumes) / max(found.volumes.mean(), 1e-300) for found in references]
-    about = (
-        f"{len(frames)} mocap frames that cross themselves, of every motion; reference: the mean "
-        f"of three directions at {REFERENCE_RAYS} x {REFERENCE_RAYS} rays, whose own three volumes "
-        f"differ by {100 * np.median(apart):.2g} % in the median and {100 * np.max(apart):.2g} % "
-        f"at most. The gradient is projected on {POSE_DIRECTIONS} random pose directions; its "
-        "error is the norm of the difference over the norm of the reference. A cost is the ratio "
-        f"to the plain beams' time in the same process, the least of {REPEATS} alternating runs "
-        "of each."
-    )
+        for title, store in kept.items():
+            task = bar.add_task(title, total=len(frames))
+            found[title] = []
+            for frame, name in zip(frames, names, strict=True):
+                if not store.has(name):
+                    print(f"{title}: {name}, {len(found[title]) + 1} of {len(frames)}", flush=True)
+                found[title].append(store.of(name, bodies.vertices(frame), bodies.faces))
+                bar.advance(task)
+    references, truths = found["by rays"], found["exact"]
+    about = introduction(bodies, frames, references, truths, settings)
     print(about)
     parts = []
     for rays in settings.rays:
         figures = []
         with progress() as bar:
-            pairs = zip(frames, references, strict=True)
-            for frame, reference in bar.track(pairs, total=len(frames), description=str(rays)):
-                figures.append(compared(bodies, frame, rays, reference, settings.seed))
-        for table in tables(rays, figures, volumes, names):
+            for k in bar.track(range(len(frames)), description=str(rays)):
+                figures.append(
+                    compared(bodies, frames[k], rays, references[k], truths[k], settings.seed)
+                )
+        for table in tables(rays, figures, references, truths, names):
             table.print()
             parts.append(table.markdown())
     if settings.record:
