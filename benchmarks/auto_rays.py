@@ -165,31 +165,32 @@ def tables(
     names: list[str],
 ) -> list[Table]:
     """The spread of the errors and costs, and the frames that fall short."""
-    columns = Figures(*np.array(figures).T)
-    volume, gradient, cost = columns.volume, columns.gradient, columns.cost_with_gradient
+    volume, error, gradient, exact_error, exact_gradient, volume_cost, cost, seconds = np.array(
+        figures
+    ).T
     sizes = np.array([reference.volume for reference in references])
-    relative = relative_to(columns.error, sizes)
-    exactly = relative_to(columns.exact_error, np.array([truth.volume for truth in truths]))
+    relative = relative_to(error, sizes)
+    exactly = relative_to(exact_error, np.array([truth.volume for truth in truths]))
     good, exactly_good = (
-        (part <= VOLUME_WITHIN) | (np.abs(error) <= VOLUME_FLOOR)
-        for part, error in ((relative, columns.error), (exactly, columns.exact_error))
+        (part <= VOLUME_WITHIN) | (np.abs(off) <= VOLUME_FLOOR)
+        for part, off in ((relative, error), (exactly, exact_error))
     )
     steep = gradient <= GRADIENT_WITHIN
     volume_target = f"{VOLUME_WITHIN:.1%} or {VOLUME_FLOOR:g} m^3"
     lines = (
         ("volume error, %", 100 * relative, volume_target, good),
-        ("volume error, m^3", np.abs(columns.error), "", None),
+        ("volume error, m^3", np.abs(error), "", None),
         ("gradient error, %", 100 * gradient, f"{GRADIENT_WITHIN:.0%}", steep),
         ("volume error against the exact one, %", 100 * exactly, volume_target, exactly_good),
         (
             "gradient error against the exact one, %",
-            100 * columns.exact_gradient,
+            100 * exact_gradient,
             f"{GRADIENT_WITHIN:.0%}",
-            columns.exact_gradient <= GRADIENT_WITHIN,
+            exact_gradient <= GRADIENT_WITHIN,
         ),
-        (f"cost of the volume, {PLAIN_RAYS} x {PLAIN_RAYS} being 1", columns.cost, "", None),
+        (f"cost of the volume, {PLAIN_RAYS} x {PLAIN_RAYS} being 1", volume_cost, "", None),
         ("cost of volume and gradient, likewise", cost, "median 1", cost <= 1),
-        ("milliseconds for both", 1e3 * columns.seconds, "", None),
+        ("milliseconds for both", 1e3 * seconds, "", None),
     )
     spread = Table(
         f'rays="{rays}"' if rays == "auto" else f"rays={rays}",
@@ -223,7 +224,7 @@ def tables(
                 f"{volume[k]:.4g}",
                 f"{100 * relative[k]:.3g}",
                 f"{100 * gradient[k]:.3g}",
-                f"{100 * columns.exact_gradient[k]:.3g}",
+                f"{100 * exact_gradient[k]:.3g}",
                 f"{cost[k]:.2f}",
             )
             for k in short
@@ -270,7 +271,7 @@ def main(settings: Settings) -> None:
     frames = overlapping_frames(bodies, settings.frames, settings.seed)
     names = [bodies.mocap.names[frame] for frame in frames]
     truths_file = settings.cache.with_stem(settings.cache.stem + "_exact")
-    kept = {"exact": Kept(truths_file, exact), "by rays": Kept(settings.cache, by_rays)}
+    kept = {"exact": Kept(truths_file, exact), "rays": Kept(settings.cache, by_rays)}
     found: dict[str, list[Reference]] = {}
     with progress() as bar:
         for title, store in kept.items():
@@ -281,7 +282,7 @@ def main(settings: Settings) -> None:
                     print(f"{title}: {name}, {len(found[title]) + 1} of {len(frames)}", flush=True)
                 found[title].append(store.of(name, bodies.vertices(frame), bodies.faces))
                 bar.advance(task)
-    references, truths = found["by rays"], found["exact"]
+    references, truths = found["rays"], found["exact"]
     about = introduction(bodies, frames, references, truths, settings)
     print(about)
     parts = []

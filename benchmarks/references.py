@@ -27,6 +27,9 @@ REFERENCE_RAYS = 4096
 # Small against any piece that weighs anything, large against a double's rounding.
 _IN_FRONT = 1e-8
 
+# libigl stops cutting at 1,000 intersections by default.
+_NO_CUTOFF = 1_000_000
+
 
 class Reference(NamedTuple):
     """An overlap's volume, and its derivative with respect to the vertices."""
@@ -60,7 +63,7 @@ def exact(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> 
         ValueError: a piece of the surface has no whole winding number in front of it: the mesh
             is not closed.
     """
-    found = cgal.remesh_self_intersections(vertices, faces, cutoff=len(faces))
+    found = cgal.remesh_self_intersections(vertices, faces, cutoff=_NO_CUTOFF)
     cut, pieces, origin = (np.asarray(found[k]) for k in (0, 1, 3))
     corner = cut[pieces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
