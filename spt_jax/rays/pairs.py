@@ -16,11 +16,12 @@ from jaxtyping import Bool, Float, Int
 from spt_jax.rays.pair_layout import CLUSTER, Layout, Topology, prepared
 
 # Candidates handled at once: bounds the memory at some tens of megabytes for any mesh.
-_CHUNK = 1 << 18
+_CHUNK = 1 << 16
 # A coordinate of a box takes 20 bits and a guard bit: three to a word, six tests to two words.
 _FIELD = 21
 _STEPS = (1 << (_FIELD - 1)) - 1
 _GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
+_BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
 # Relative to the size of what is multiplied, far above float64's rounding.
 _ROUNDING = 1e-14
 
@@ -64,18 +65,9 @@ def edge_crossings(
     shape = _shape(points, layout)
     touching = None if among is None else _touching(topology, among)
     found = list(_around_vertices(points, topology, layout, shape))
-    clusters = _clusters(shape)
-    for a, b in _meeting_clusters(clusters):
-        if touching is not None:
-            marked = touching[layout.face].reshape(-1, CLUSTER).any(axis=1)
-            kept = marked[a] | marked[b]
-            a, b = a[kept], b[kept]
-        for t, u in _meeting_triangles(layout, shape, clusters, a, b):
-            if touching is not None:
-                kept = touching[layout.face[t]] | touching[layout.face[u]]
-                t, u = t[kept], u[kept]
-            found.append(_edges_of_pairs(topology, layout, shape, t, u))
-    row, slot = (np.concatenate(part) for part in zip(*found, strict=True))
+    for t, u in _near_pairs(layout, shape, touching):
+        found.append(_edges_of_pairs(topology, layout, shape, t, u))
+    row, slot = _concatenate(found)
     row, face, part = _decide(points, topology, row, layout.face[slot])
     if among is not None:
         kept = _edges_of(topology, among)[topology.edge_id[row]] | among[face]
@@ -240,15 +232,46 @@ def _medians(x, layout: Layout, count):
     return np.bincount(median, minlength=count + 1)[:-1]
 
 
-def _clusters(shape: _Shape):
-    low, high = shape.low, shape.high
-    while low.shape[1] > shape.low.shape[1] // CLUSTER:
+def _near_pairs(layout: Layout, shape: _Shape, touching):
+    """Pairs of slots that share no vertex and whose boxes meet, in parts of bounded size."""
+    waiting, size = [], 0
+    for t, u in _all_near_pairs(layout, shape):
+        if touching is not None:
+            kept = touching[layout.face[t]] | touching[layout.face[u]]
+            t, u = t[kept], u[kept]
+        waiting.append((t, u))
+        size += len(t)
+        if size > _CHUNK:
+            yield _concatenate(waiting)
+            waiting, size = [], 0
+    if waiting:
+        yield _concatenate(waiting)
+
+
+def _concatenate(pairs):
+    return tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
+
+
+def _all_near_pairs(layout: Layout, shape: _Shape):
+    for part in _parts(np.ones(layout.apart.shape[1], np.int64)):
+        yield _kept_meeting(shape, *layout.apart[:, part])
+    clusters = _joined(shape.low, shape.high)
+    groups = _joined(clusters.low, clusters.high)
+    for a, b in _meeting_boxes(groups):
+        for c, d in _meeting_members(clusters.low_word, clusters.high_word, a, b):
+            yield from _meeting_triangles(layout, shape, clusters, c, d)
+
+
+def _joined(low, high) -> _Boxes:
+    """The boxes around every `CLUSTER` boxes."""
+    count = low.shape[1] // CLUSTER
+    while low.shape[1] > count:
         low = np.minimum(low[:, ::2], low[:, 1::2])
         high = np.maximum(high[:, ::2], high[:, 1::2])
     return _Boxes(low, high, _word(low), _word(high) | _GUARDS)
 
 
-def _meeting_clusters(boxes: _Boxes):
+def _meeting_boxes(boxes: _Boxes):
     """Pairs of boxes that meet, each with itself too, in parts of bounded size."""
     axis = int(np.argmax(np.ptp(boxes.low, axis=1)))
     order = np.argsort(boxes.low[axis])
@@ -264,34 +287,34 @@ def _meeting_clusters(boxes: _Boxes):
         yield order[a[kept]], order[b[kept]]
 
 
+def _meeting_members(low, high, a, b):
+    """Pairs of the members of a and b that meet, a before b where these are the same."""
+    low, high = low.reshape(-1, CLUSTER), high.reshape(-1, CLUSTER)
+    for part in _parts(np.full(len(a), CLUSTER * CLUSTER)):
+        p, q = a[part], b[part]
+        meet = _meet(
+            low[p][:, :, None], high[p][:, :, None], low[q][:, None, :], high[q][:, None, :]
+        )
+        meet[p == q] &= _BEFORE
+        found = np.flatnonzero(meet)
+        pair = found // CLUSTER**2
+        p, q = CLUSTER * p[pair], CLUSTER * q[pair]
+        yield p + found // CLUSTER % CLUSTER, q + found % CLUSTER
+
+
 def _meeting_triangles(layout: Layout, shape: _Shape, boxes: _Boxes, a, b):
     """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
-    own = a == b
-    low, high = shape.low_word.reshape(-1, CLUSTER), shape.high_word.reshape(-1, CLUSTER)
-    a, b, c = a[~own], b[~own], a[own]
-    for part in _parts(np.full(len(c), CLUSTER * CLUSTER)):
-        x, y = low[c[part]], high[c[part]]
-        meet = layout.apart[c[part]]
-        meet &= _meet(x[:, :, None], y[:, :, None], x[:, None, :], y[:, None, :])
-        found = np.flatnonzero(meet)
-        cluster, pair = np.divmod(found, CLUSTER * CLUSTER)
-        cluster = CLUSTER * c[part][cluster]
-        yield cluster + pair // CLUSTER, cluster + pair % CLUSTER
-    for part in _parts(np.full(len(a), 2 * CLUSTER)):
-        pair_t, t = _reaching(low, high, boxes, a[part], b[part])
-        pair_u, u = _reaching(low, high, boxes, b[part], a[part])
+    for part in _parts(np.full(len(a), 3 * CLUSTER)):
+        pair_t, t = _reaching(shape, boxes, a[part], b[part])
+        pair_u, u = _reaching(shape, boxes, b[part], a[part])
         count = np.bincount(pair_u, minlength=len(a[part]))
         first = (np.cumsum(count) - count)[pair_t]
         count = count[pair_t]
         for piece in _parts(count):
             second, at = _spread(first[piece], count[piece])
-            f, g = t[piece][at], u[second]
-            kept = np.flatnonzero(
-                _meet(shape.low_word[f], shape.high_word[f], shape.low_word[g], shape.high_word[g])
-            )
-            f, g = f[kept], g[kept]
-            shared = np.zeros(len(f), bool)
+            f, g = _kept_meeting(shape, t[piece][at], u[second])
             p, q = layout.corners.take(f, axis=1), layout.corners.take(g, axis=1)
+            shared = np.zeros(len(f), bool)
             for i in range(3):
                 for j in range(3):
                     shared |= p[i] == q[j]
@@ -299,10 +322,19 @@ def _meeting_triangles(layout: Layout, shape: _Shape, boxes: _Boxes, a, b):
             yield f[kept], g[kept]
 
 
-def _reaching(low, high, boxes: _Boxes, a, b):
+def _kept_meeting(shape: _Shape, t, u):
+    low, high = shape.low_word, shape.high_word
+    kept = np.flatnonzero(_meet(low[t], high[t], low[u], high[u]))
+    return t[kept], u[kept]
+
+
+def _reaching(shape: _Shape, boxes: _Boxes, a, b):
     """The triangles of cluster a whose boxes meet the box of b: number of the pair, and slot."""
-    meet = _meet(low[a], high[a], boxes.low_word[b][:, None], boxes.high_word[b][:, None])
-    found = np.flatnonzero(meet)
+    low = shape.low_word.reshape(-1, CLUSTER)[a]
+    high = shape.high_word.reshape(-1, CLUSTER)[a]
+    found = np.flatnonzero(
+        _meet(low, high, boxes.low_word[b][:, None], boxes.high_word[b][:, None])
+    )
     pair = found // CLUSTER
     return pair, found + CLUSTER * (a[pair] - pair)
 
