@@ -6,9 +6,11 @@ of p's own triangles. On a closed mesh F + O + B = 0; the winding number is F ju
 F + O just after. Where O is +1 or -1 the ray goes through the surface at p, whose outer side has
 w_out = min(F, F + O). Where O is 0 the ray only touches the surface there, as on a silhouette:
 either both of its sides are outside the cone of p's triangles, and w_out = F, or both are within,
-and w_out = F - 1. The part of the cone that is nearest to the ray tells which.
+and w_out = F - 1. The part of the cone that is nearest to the ray tells which, so that one
+direction decides every vertex of a closed mesh.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -16,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.rays.beam import screen_frame
+from spt_jax.rays.vertex_cone import within_cone
 
 # The rays lean from the direction that is asked for, by these parts of the screen's axes, and the
 # screen is turned about them: what is modelled has its faces and edges along the axes, and a face
@@ -23,14 +26,26 @@ from spt_jax.rays.beam import screen_frame
 _LEAN = (0.1381966011250105, 0.0901699437494742)
 _TURN = np.arctan((np.sqrt(5.0) - 1.0) / 2.0)
 
-# For vertices that none of the caller's directions decides.
+# For vertices whose rays meet a hole in all of the caller's directions.
 _SPARE = np.array([[0.48, -0.36, -0.8], [-0.64, 0.6, -0.48]])
 
-# A sheet nearer to the vertex than this part of the mesh's size touches it; as in levels.py.
+# A sheet nearer to the vertex than this part of the mesh's size touches it, as in levels.py.
 _THINNEST = 1e-7
 
-# Pairs of a vertex and a triangle that are looked at together; each takes about 100 bytes.
-_MOST_PAIRS = 1 << 20
+# How many strips the screen is cut into, and columns, for each root of the number of vertices.
+# With fewer strips a triangle is paired with more vertices that it cannot contain, with more it
+# is looked up more often: on a body all of 1 to 2 cost the same.
+_STRIPS, _COLUMNS = 1.4, 4.0
+
+# Triangles, and pairs of a vertex and a triangle, that are worked on together. So few that memory
+# is used again rather than asked for again, which takes a third off the time; but in proportion
+# to the vertices, since each of these turns adds to a sum for every vertex.
+_FACES, _PAIRS = 1 << 12, 1 << 15
+
+# Two numbers below 2^31 in one integer, and its bits where a borrow shows that a difference of
+# two such integers is negative in one of its halves: one test for a whole bounding box.
+_HALF = 32
+_BORROWS = np.int64(-(1 << 63)) | np.int64(1 << 31)
 
 
 def vertex_winding(
@@ -40,32 +55,34 @@ def vertex_winding(
 ) -> Int[np.ndarray, "V"]:
     """The winding number just outside the mesh's own surface at every vertex, whatever the depth.
 
-    Its sign is the vertex's class: 0 on V_0, +1 on V_out, -1 on V_in. The first direction serves
-    all vertices. The next ones, and then two of our own, serve those whose ray met a hole (signs
-    that do not cancel) or crosses p's own triangles more than once; what no direction decides is
-    0, and so is a vertex that no triangle uses. A sheet that touches p counts as in front of
-    it or behind it, whichever brings the number nearer to 0: contact is no overlap.
+    Its sign is the vertex's class: 0 on V_0, +1 on V_out, -1 on V_in. It does not depend on the
+    direction: the first one serves all vertices, the next ones, and then two of our own, those
+    whose ray met a hole, where signs do not cancel. A vertex that no direction decides is 0, and
+    so is one that no triangle uses. Where more than one number is right the one nearest to 0 is
+    taken: a sheet that touches p counts as in front of it or behind it (contact is no overlap),
+    and triangles that wind about p twice as either of their layers. Where no point is outside all
+    of p's triangles, as on a saddle that is folded over, w_out is that of the nearest side.
     """
     winding = np.zeros(len(vertices), np.int64)
-    if len(faces) == 0:
-        return winding
     vertices = vertices.astype(np.float64, copy=False)
     undecided = np.zeros(len(vertices), bool)
     undecided[faces.ravel()] = True
-    with np.errstate(all="ignore"):  # not finite or near overflow: comparisons are false
+    with np.errstate(all="ignore"):  # what is not finite compares as false, and counts as 0
         for direction in (*directions, *_SPARE):
-            frame = _generic_frame(direction)
             sample = np.flatnonzero(undecided)
-            own, least, most, is_open = _sums(frame @ vertices.T, faces, sample)
-            known = np.flatnonzero(~is_open & (np.abs(own) <= 1))
-            sample, own, least, most = sample[known], own[known], least[known], most[known]
-            drop = np.minimum(own, 0)
-            touched = np.flatnonzero(own == 0)
-            drop[touched] -= _within_cone(vertices, faces, sample[touched], -frame[2])
-            winding[sample] = np.clip(0, least + drop, most + drop)
-            undecided[sample] = False
-            if not undecided.any():
+            if len(sample) == 0:
                 break
+            frame = _generic_frame(direction)
+            own, least, most, total = _sums(frame @ vertices.T, faces, sample)
+            least += np.minimum(own, 0)
+            most += np.maximum(own, 0) - 1
+            grazed = np.flatnonzero(own == 0)
+            within = within_cone(vertices, faces, sample[grazed], -frame[2])
+            least[grazed] -= within
+            most[grazed] += ~within
+            closed = np.flatnonzero(total == 0)
+            winding[sample[closed]] = np.clip(0, least[closed], most[closed])
+            undecided[sample[closed]] = False
     return winding
 
 
@@ -74,152 +91,211 @@ def _generic_frame(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"
     return screen_frame(d + _LEAN[0] * u + _LEAN[1] * v, _TURN)
 
 
-class _Triangles(NamedTuple):
-    """Triangles on the screen; a vertex is named by its place in the order of rows."""
-
-    low: Int[np.ndarray, "F"]
-    mid: Int[np.ndarray, "F"]
-    high: Int[np.ndarray, "F"]
-    faces_ray_with_mid_right: Bool[np.ndarray, "F"]
-
-
 def _sums(
     screen: Float[np.ndarray, "3 V"], faces: Int[np.ndarray, "F 3"], sample: Int[np.ndarray, "S"]
-) -> tuple[Int[np.ndarray, "S"], Int[np.ndarray, "S"], Int[np.ndarray, "S"], Bool[np.ndarray, "S"]]:
-    """For each sampled vertex: O, the least and the greatest F, and whether signs do not cancel.
+) -> Int[np.ndarray, "4 S"]:
+    """O, the least F, the greatest F and F + O + B at each vertex of the sample."""
+    grid = _grid(screen, sample)
+    num = len(grid.rank)
+    own, least, most, total = sums = np.zeros((4, num))
+    at_once = max(_FACES, num // 2)
+    for first in range(0, len(faces), at_once):
+        triangles = _triangles(grid, faces[first : first + at_once])
+        own += _own_signs(grid, triangles)
+        for vertex, face in _pairs(grid, triangles):
+            vertex, sign, ahead, touches = _crossings(grid, triangles, vertex, face)
+            total += np.bincount(vertex, sign, num)
+            in_front = np.bincount(vertex, sign * ((ahead < 0) & ~touches), num)
+            least += in_front
+            most += in_front
+            if touches.any():  # in front or behind, as is needed
+                vertex, sign = vertex[touches], sign[touches]
+                least += np.bincount(vertex, np.minimum(sign, 0), num)
+                most += np.bincount(vertex, np.maximum(sign, 0), num)
+    total += own
+    return sums[:, grid.rank[sample]].astype(np.int64)
 
-    A triangle contains p when one of the two of its edges that cross p's row is to the right of
-    p. Both triangles of an edge decide that by the same operations on the same numbers, so the
-    signs cancel exactly on a closed mesh. Rows are compared by rank: no two vertices share one.
+
+class _Grid(NamedTuple):
+    """The vertices on the screen, named by their rank from its lowest row to its highest.
+
+    Vertices in one row have different ranks too, so that each is above or below any other. Strips
+    hold equal numbers of vertices, and so do columns: a mesh may have its vertices in one corner.
     """
+
+    rank: Int[np.ndarray, "V"]  # of each vertex of the mesh
+    x: Float[np.ndarray, "V"]  # this and what follows in the order of ranks
+    y: Float[np.ndarray, "V"]
+    z: Float[np.ndarray, "V"]
+    place: Int[np.ndarray, "V"]  # in the order of x; vertices of one x share it
+    strip: Int[np.ndarray, "V"]  # by rank
+    column: Int[np.ndarray, "V"]  # by place
+    num_columns: int
+    point: Int[np.ndarray, "S"]  # the sample by strip and column: rank and place in one integer
+    begin: Int[np.ndarray, "C"]  # where each strip's columns begin in `point`
+    thinnest: float
+
+
+def _grid(screen: Float[np.ndarray, "3 V"], sample: Int[np.ndarray, "S"]) -> _Grid:
     num = screen.shape[1]
     order = np.argsort(screen[1])
     rank = np.empty(num, np.int64)
     rank[order] = np.arange(num)
     x, y, z = screen[:, order]
-    a, b, c = rank[faces.T]
+    order = np.argsort(x)
+    ascending = x[order]
+    place = np.zeros(num, np.int64)
+    place[order[1:]] = np.cumsum(ascending[1:] > ascending[:-1])
+
+    strips, columns = (int(n * np.sqrt(len(sample))) + 1 for n in (_STRIPS, _COLUMNS))
+    strip, column = np.arange(num) * strips // num, np.arange(num) * columns // num
+    sampled = rank[sample]
+    cell = strip[sampled] * columns + column[place[sampled]]
+    sampled = sampled[np.argsort(cell)]
+    begin = np.zeros(strips * columns + 1, np.int64)
+    np.cumsum(np.bincount(cell, minlength=strips * columns), out=begin[1:])
+    point = (sampled << _HALF) | place[sampled]
+    thinnest = _THINNEST * float(np.ptp(screen, axis=1).max())
+    return _Grid(rank, x, y, z, place, strip, column, columns, point, begin, thinnest)
+
+
+class _Triangles(NamedTuple):
+    """Some of the triangles, with their corners sorted from low to high.
+
+    Each has three edges, from the lower to the higher end: low-high, low-mid, mid-high.
+    """
+
+    low: Int[np.ndarray, "F"]
+    mid: Int[np.ndarray, "F"]
+    high: Int[np.ndarray, "F"]
+    even: Bool[np.ndarray, "F"]  # whether (low, mid, high) goes around as the triangle does
+    start: Int[np.ndarray, "E"]
+    end: Int[np.ndarray, "E"]
+    start_x: Float[np.ndarray, "E"]
+    start_y: Float[np.ndarray, "E"]
+    run: Float[np.ndarray, "E"]
+    rise: Float[np.ndarray, "E"]
+
+    def left_of(
+        self, edge: Int[np.ndarray, "N"], x: Float[np.ndarray, "N"], y: Float[np.ndarray, "N"]
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether points are to the left of edges that cross their rows.
+
+        Both triangles of an edge compute the same, so that signs cancel whatever the rounding.
+        Points to one side of both of the edge's ends come out on that side: differences and
+        products are rounded monotonely. So nothing is lost outside a bounding box.
+        """
+        x, y = x - self.start_x[edge], y - self.start_y[edge]
+        x *= self.rise[edge]
+        y *= self.run[edge]
+        return x < y
+
+
+def _triangles(grid: _Grid, faces: Int[np.ndarray, "F 3"]) -> _Triangles:
+    a, b, c = grid.rank[faces.T]
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     mid = a + b + c - low - high
-    even = (a < b).astype(np.int8) + (b < c) + (c < a) == 2
-
-    # Edges from the lower to the higher end: low-high, low-mid, mid-high.
+    even = ~((a < b) ^ (b < c) ^ (c < a))
     start, end = np.concatenate([low, low, mid]), np.concatenate([high, mid, high])
-    edge_x, edge_y = x[start], y[start]
-    rise = y[end] - edge_y
-    slope = (x[end] - edge_x) / np.where(rise > 0, rise, 1.0)
-
-    sampled = np.zeros(num, bool)
-    sampled[rank[sample]] = True
-
-    def is_left(vertex, edge):
-        return x[vertex] < edge_x[edge] + (y[vertex] - edge_y[edge]) * slope[edge]
-
-    # p's own triangles: of the corners only the middle one can be inside, by the half-open rule.
-    left_of_long = is_left(mid, np.arange(len(low)))
-    own = np.bincount(mid, np.where(left_of_long, np.where(even, -1, 1), 0), num)
-    size = np.ptp(screen, axis=1).max()
-    total = own.copy()
-    least, most = np.zeros(num), np.zeros(num)
-    for vertex, face in _pairs(x, low, mid, high, sampled):
-        short = face + len(low) * (1 + (vertex >= mid[face]))
-        xl = edge_x[face] + (y[vertex] - edge_y[face]) * slope[face]
-        xs = edge_x[short] + (y[vertex] - edge_y[short]) * slope[short]
-        px = x[vertex]
-        left_of_short = px < xs
-        kept = np.flatnonzero((px < xl) != left_of_short)
-        vertex, face, short, xl, xs, left_of_short = (
-            w[kept] for w in (vertex, face, short, xl, xs, left_of_short)
-        )
-        sign = np.where(even[face] == left_of_short, 1, -1)
-        e0, e1 = low[face], high[face]
-        zl = z[e0] + (y[vertex] - y[e0]) * (z[e1] - z[e0]) / (y[e1] - y[e0])
-        e0, e1 = start[short], end[short]
-        zs = z[e0] + (y[vertex] - y[e0]) * (z[e1] - z[e0]) / (y[e1] - y[e0])
-        ahead = zl + (x[vertex] - xl) * (zs - zl) / (xs - xl) - z[vertex]
-        total += np.bincount(vertex, sign, num)
-        near = np.abs(ahead) < 1e-3 * size
-        nf = np.flatnonzero(near)
-        tri = face[nf]
-        p = np.stack([x, y, z])
-        n = np.cross(p[:, mid[tri]] - p[:, low[tri]], p[:, high[tri]] - p[:, low[tri]], axis=0)
-        touch = nf[np.abs(ahead[nf] * n[2]) <= _THINNEST * size * np.sqrt((n * n).sum(axis=0))]
-        front = ahead < 0
-        front[touch] = False
-        front = np.bincount(vertex, sign * front, num)
-        least += front
-        most += front
-        if len(touch):
-            least += np.bincount(vertex[touch], np.minimum(sign[touch], 0), num)
-            most += np.bincount(vertex[touch], np.maximum(sign[touch], 0), num)
-    result = np.stack([own, least, most, total])[:, rank[sample]].astype(np.int64)
-    return *result[:3], result[3] != 0
+    x, y = grid.x[start], grid.y[start]
+    run, rise = grid.x[end] - x, grid.y[end] - y
+    return _Triangles(low, mid, high, even, start, end, x, y, run, rise)
 
 
-def _pairs(x, low, mid, high, sampled):
-    num = len(x)
-    samples = np.flatnonzero(sampled)
-    n = len(samples)
-    strips = int(np.sqrt(n)) + 1
-    columns = int(6 * np.sqrt(n)) + 1
-    xorder = np.argsort(x)
-    strip = np.cumsum(sampled) * strips // (n + 1)
-    column = np.empty(num, np.int64)
-    column[xorder] = np.cumsum(sampled[xorder]) * columns // (n + 1)
-    cell = strip[samples] * columns + column[samples]
-    by_cell = samples[np.argsort(cell)]
-    begins = np.zeros(strips * columns + 1, np.int64)
-    np.cumsum(np.bincount(cell, minlength=strips * columns), out=begins[1:])
-    first, last = strip[np.minimum(low + 1, num - 1)], strip[high - 1]
-    cl, cm, ch = column[low], column[mid], column[high]
-    c0, c1 = np.minimum(np.minimum(cl, cm), ch), np.maximum(np.maximum(cl, cm), ch)
-    xl, xm, xh = x[low], x[mid], x[high]
-    x0, x1 = np.minimum(np.minimum(xl, xm), xh), np.maximum(np.maximum(xl, xm), xh)
-    rows = np.where(high - low > 1, last - first + 1, 0)
-    of = np.repeat(np.arange(len(low)), rows)
-    row = np.arange(len(of)) + (first - (np.cumsum(rows) - rows))[of]
-    row *= columns
-    begin, end = begins[row + c0[of]], begins[row + c1[of] + 1]
-    width = end - begin
-    some = np.flatnonzero(width)
-    of, begin, width = of[some], begin[some], width[some]
-    of_row = np.repeat(np.arange(len(of)), width)
-    vertex = by_cell[np.arange(len(of_row)) + (begin - (np.cumsum(width) - width))[of_row]]
-    face = of[of_row]
-    kept = np.flatnonzero((low[face] < vertex) & (vertex < high[face]))
-    vertex, face = vertex[kept], face[kept]
-    px = x[vertex]
-    kept = np.flatnonzero((x0[face] <= px) & (px < x1[face]) & (mid[face] != vertex))
-    yield vertex[kept], face[kept]
+def _own_signs(grid: _Grid, triangles: _Triangles) -> Float[np.ndarray, "V"]:
+    # A row belongs to an edge from its lower end up to below its higher one, and a point on an
+    # edge is not to the left of it: of its own corners a triangle contains at most the middle one.
+    mid = triangles.mid
+    contained = triangles.left_of(np.arange(len(mid)), grid.x[mid], grid.y[mid])
+    return np.bincount(mid, contained * np.where(triangles.even, -1.0, 1.0), len(grid.rank))
 
 
-def _within_cone(
-    vertices: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    sample: Int[np.ndarray, "S"],
-    ray: Float[np.ndarray, "3"],
-) -> Bool[np.ndarray, "S"]:
-    """Whether a step from the vertex along the unit vector `ray` leads under its own triangles."""
-    place = np.full(len(vertices), -1)
-    place[sample] = np.arange(len(sample))
-    of = place[faces].ravel()
-    corner = np.flatnonzero(of >= 0)
-    face, k = np.divmod(corner, 3)
-    of = of[corner]
-    p = vertices[faces[face, k]]
-    e, f = (vertices[faces[face, (k + i) % 3]] - p for i in (1, 2))
-    e, f = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in (e, f))
-    n = np.cross(e, f)
-    s = np.linalg.norm(n, axis=1)
-    n /= s[:, None]
-    height = n @ ray
-    inside = (np.cross(n, e) @ ray > 0) & (np.cross(f, n) @ ray > 0)
-    along_e, along_f = np.maximum(e @ ray, 0), np.maximum(f @ ray, 0)
-    nearest = np.where((along_e >= along_f)[:, None], along_e[:, None] * e, along_f[:, None] * f)
-    nearest = np.where(inside[:, None], ray - height[:, None] * n, nearest)
-    away = ray - nearest
-    square = np.einsum("ki,ki->k", away, away)
-    least = np.full(len(sample), np.inf)
-    np.fmin.at(least, of, square)
-    weight = np.where(square < 1, 1.0, np.arctan2(s, np.einsum("ki,ki->k", e, f)))
-    side = np.where(square <= least[of] * (1 + 1e-9), weight * np.einsum("ki,ki->k", n, away), 0.0)
-    return np.bincount(of, np.where(np.isfinite(side), side, 0.0), len(sample)) < 0
+def _pairs(
+    grid: _Grid, triangles: _Triangles
+) -> Iterator[tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]]:
+    """Vertices and triangles that may contain them: all in the bounding box but its own corners."""
+    place = np.stack([grid.place[w] for w in (triangles.low, triangles.mid, triangles.high)])
+    left, right = place.min(axis=0), place.max(axis=0)
+    face = np.flatnonzero((triangles.high - triangles.low > 1) & (left < right))
+    low, high = triangles.low[face] + 1, triangles.high[face] - 1
+    left, right, mid = left[face], right[face] - 1, triangles.mid[face]
+    least, most = (low << _HALF) | left, (high << _HALF) | right
+    first = grid.strip[low]
+    strips = grid.strip[high] - first + 1
+    first *= grid.num_columns
+    begins, ends = first + grid.column[left], first + grid.column[right] + 1
+
+    fewest = max(_PAIRS, len(grid.rank))
+    for some in _turns(strips, fewest):
+        box = np.repeat(np.arange(some.start, some.stop), strips[some])
+        up = np.arange(len(box)) - np.repeat(_starts(strips[some]), strips[some])
+        up *= grid.num_columns
+        begin = grid.begin[up + begins[box]]
+        width = grid.begin[up + ends[box]] - begin
+        kept = np.flatnonzero(width)
+        box, begin, width = box[kept], begin[kept], width[kept]
+        for part in _turns(width, fewest):
+            of = np.repeat(box[part], width[part])
+            at = np.repeat(begin[part] - _starts(width[part]), width[part])
+            at += np.arange(len(at))
+            point = grid.point[at]
+            outside = point - least[of]
+            outside |= most[of] - point
+            outside &= _BORROWS
+            kept = np.flatnonzero(outside == 0)
+            vertex, of = point[kept] >> _HALF, of[kept]
+            kept = np.flatnonzero(vertex != mid[of])
+            yield vertex[kept], face[of[kept]]
+
+
+def _starts(sizes: Int[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
+    return np.cumsum(sizes) - sizes
+
+
+def _turns(sizes: Int[np.ndarray, "N"], most: int) -> Iterator[slice]:
+    """Slices of about `most` in all: more only where a single size, the last, is."""
+    turn = np.cumsum(sizes) // most
+    cuts = [0, *(np.flatnonzero(turn[1:] != turn[:-1]) + 1).tolist(), len(sizes)]
+    for start, stop in itertools.pairwise(cuts):
+        yield slice(start, stop)
+
+
+def _crossings(
+    grid: _Grid, of: _Triangles, vertex: Int[np.ndarray, "N"], face: Int[np.ndarray, "N"]
+) -> tuple[
+    Int[np.ndarray, "K"], Float[np.ndarray, "K"], Float[np.ndarray, "K"], Bool[np.ndarray, "K"]
+]:
+    """The pairs that do meet: vertex, sign, depth behind the vertex, and whether they touch."""
+    count = len(of.mid)
+    short = face + count * (1 + (vertex >= of.mid[face]))
+    x, y = grid.x[vertex], grid.y[vertex]
+    left_of_short = of.left_of(short, x, y)
+    met = np.flatnonzero(of.left_of(face, x, y) != left_of_short)
+    vertex, face, short, x, y = vertex[met], face[met], short[met], x[met], y[met]
+    # Counter-clockwise, facing the ray, where an even triangle has its short edges on the right.
+    sign = np.where(of.even[face] == left_of_short[met], 1.0, -1.0)
+
+    # Interpolated between the edges, never extrapolated from the plane, as in crossings.py.
+    (x_long, z_long), (x_short, z_short) = _on_row(grid, of, face, y), _on_row(grid, of, short, y)
+    across = np.clip((x - x_long) / (x_short - x_long), 0.0, 1.0)
+    ahead = z_long + across * (z_short - z_long) - grid.z[vertex]
+
+    # How far the plane is, not how far along the ray. A triangle that leans less than a thousandth
+    # from the ray is taken to be a thousandth of its depth away.
+    touches = np.abs(ahead) < 1e3 * grid.thinnest
+    near = np.flatnonzero(touches)
+    if len(near):
+        corners = np.stack([of.low, of.mid, of.high])[:, face[near]]
+        a, b, c = np.stack([grid.x, grid.y, grid.z], axis=1)[corners]
+        normal = np.cross(b - a, c - a)
+        distance = np.abs(ahead[near] * normal[:, 2])
+        touches[near] = distance <= grid.thinnest * np.linalg.norm(normal, axis=1)
+    return vertex, sign, ahead, touches
+
+
+def _on_row(
+    grid: _Grid, of: _Triangles, edge: Int[np.ndarray, "N"], y: Float[np.ndarray, "N"]
+) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    part = (y - of.start_y[edge]) / of.rise[edge]
+    z = grid.z[of.start[edge]]
+    return of.start_x[edge] + part * of.run[edge], z + part * (grid.z[of.end[edge]] - z)
