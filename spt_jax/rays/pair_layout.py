@@ -51,8 +51,8 @@ class Layout:
     Attributes:
         face: the face in each slot, 0 in empty ones.
         empty: the empty slots.
-        corners: the vertices of the face in each slot.
-        ascending: whether corner 0 < corner 1, 1 < 2 and 2 < 0 as numbers.
+        corners: the vertices of the face in each slot, by number.
+        sense: 1 where that is their order in the face, too, as a cycle; else -1.
         apart: pairs of slots of one cluster, where the faces share no vertex.
     """
 
@@ -60,7 +60,7 @@ class Layout:
     slot: Int[np.ndarray, "F"]
     empty: Int[np.ndarray, "P"]
     corners: Int[np.ndarray, "3 S"]
-    ascending: Bool[np.ndarray, "3 S"]
+    sense: Float[np.ndarray, "S"]
     apart: Int[np.ndarray, "2 N"]
 
 
@@ -175,7 +175,9 @@ def _arrange(faces: Int[np.ndarray, "F 3"], boxes: list[Float[np.ndarray, "F 6"]
     face[slot] = np.arange(len(faces))
     empty = np.flatnonzero(face < 0)
     face[empty] = 0
-    corners = np.ascontiguousarray(faces[face].T)
+    given = faces[face].T
+    corners = np.sort(given, axis=0)
+    turns = np.count_nonzero(given < np.roll(given, -1, axis=0), axis=0)
     by_cluster = corners.reshape(3, -1, CLUSTER)
     first, second = np.triu_indices(CLUSTER, 1)
     apart = np.ones((total, len(first)), bool)
@@ -188,6 +190,6 @@ def _arrange(faces: Int[np.ndarray, "F 3"], boxes: list[Float[np.ndarray, "F 6"]
         slot=slot,
         empty=empty,
         corners=corners,
-        ascending=corners < np.roll(corners, -1, axis=0),
+        sense=np.where(turns == 2, 1.0, -1.0),
         apart=np.stack([CLUSTER * cluster + first[pair], CLUSTER * cluster + second[pair]]),
     )

@@ -68,7 +68,7 @@ def edge_crossings(
     for t, u in _near_pairs(layout, shape, touching):
         found.append(_edges_of_pairs(topology, layout, shape, t, u))
     row, slot = _concatenate(found)
-    row, face, part = _decide(points, topology, row, layout.face[slot])
+    row, face, part = _decide(points, topology, layout, row, slot)
     if among is not None:
         kept = _edges_of(topology, among)[topology.edge_id[row]] | among[face]
         row, face, part = row[kept], face[kept], part[kept]
@@ -135,12 +135,8 @@ def _face_boxes(points, faces):
 def _shape(points, layout: Layout) -> _Shape:
     corner = points.take(layout.corners, axis=1)
     a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
-    u, v = b - a, c - a
-    normal = np.empty_like(a)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        normal[k] = u[i] * v[j]
-        normal[k] -= u[j] * v[i]
+    normal = _cross(b - a, c - a)
+    normal *= layout.sense
     normal[:, layout.empty] = 0.0
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     extent = (high - low).sum(axis=0)
@@ -201,8 +197,7 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: _Shape):
     Then they do not overlap. Ties of x_k are broken by vertex number, as if moved by nothing.
     """
     count = points.shape[1]
-    flat = layout.corners.ravel()
-    d = np.stack([np.bincount(flat, np.tile(n, 3), count) for n in shape.normal])
+    d = np.stack([sum(np.bincount(at, n, count) for at in layout.corners) for n in shape.normal])
     axis = np.abs(d).argmin(axis=0)
     every = np.arange(count)
     d[axis, every] = 0.0
@@ -222,12 +217,10 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: _Shape):
 
 def _medians(x, layout: Layout, count):
     """In how many of its triangles each vertex has the coordinate between the two others."""
-    turned = x[1], x[2], x[0]
-    rises = [
-        (p < q) | ((p == q) & up) for p, q, up in zip(x, turned, layout.ascending, strict=True)
-    ]
+    # Corners are sorted by number, so this is what breaks ties.
+    first, second, third = x[0] <= x[1], x[1] <= x[2], x[2] < x[0]
     a, b, c = layout.corners
-    median = np.where(rises[0] == rises[1], b, np.where(rises[1] == rises[2], c, a))
+    median = np.where(first == second, b, np.where(second == third, c, a))
     median[layout.empty] = count
     return np.bincount(median, minlength=count + 1)[:-1]
 
@@ -310,16 +303,22 @@ def _meeting_triangles(layout: Layout, shape: _Shape, boxes: _Boxes, a, b):
         count = np.bincount(pair_u, minlength=len(a[part]))
         first = (np.cumsum(count) - count)[pair_t]
         count = count[pair_t]
+        low_t, high_t = shape.low_word[t], shape.high_word[t]
+        low_u, high_u = shape.low_word[u], shape.high_word[u]
         for piece in _parts(count):
             second, at = _spread(first[piece], count[piece])
-            f, g = _kept_meeting(shape, t[piece][at], u[second])
-            p, q = layout.corners.take(f, axis=1), layout.corners.take(g, axis=1)
-            shared = np.zeros(len(f), bool)
-            for i in range(3):
-                for j in range(3):
-                    shared |= p[i] == q[j]
-            kept = np.flatnonzero(~shared)
-            yield f[kept], g[kept]
+            at += piece.start
+            kept = np.flatnonzero(_meet(low_t[at], high_t[at], low_u[second], high_u[second]))
+            yield _sharing_none(layout, t[at[kept]], u[second[kept]])
+
+
+def _sharing_none(layout: Layout, t, u):
+    p, q = layout.corners.take(t, axis=1), layout.corners.take(u, axis=1)
+    shared = p[0] == q[0]
+    for i, j in ((0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)):
+        shared |= p[i] == q[j]
+    kept = np.flatnonzero(~shared)
+    return t[kept], u[kept]
 
 
 def _kept_meeting(shape: _Shape, t, u):
@@ -362,7 +361,7 @@ def _straddles(shape: _Shape, points, extent, slot):
     return (height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin)
 
 
-def _decide(points, topology: Topology, row, face):
+def _decide(points, topology: Topology, layout: Layout, row, slot):
     """The candidates that cross, and what part of the edge lies before the crossing.
 
     Every sign is computed from the same numbers in the same order for all who ask for it: on
@@ -370,16 +369,30 @@ def _decide(points, topology: Topology, row, face):
     edge that leaves one triangle for the next across their common edge passes through exactly
     one of them, whatever the rounding; touching counts as lying on the positive side.
     """
-    corner = np.sort(topology.faces[face], axis=1).T
+    corner = layout.corners.take(slot, axis=1)
+    ends = topology.ends.take(row, axis=0).T
     a, b, c = (points.take(x, axis=1) for x in corner)
-    p, q = (points.take(x, axis=1) for x in topology.ends[row].T)
-    normal = np.cross(b - a, c - a, axis=0)
+    p, q = (points.take(x, axis=1) for x in ends)
+    normal = _cross(b - a, c - a)
     of_p, of_q = _dot(normal, p - a), _dot(normal, q - a)
-    sides = [_dot(np.cross(q - p, x - p, axis=0), y - p) >= 0 for x, y in ((a, b), (b, c), (a, c))]
-    kept = (of_p >= 0) != (of_q >= 0)
-    kept &= (sides[0] == sides[1]) & (sides[0] != sides[2])
-    kept = np.flatnonzero(kept)
-    return row[kept], face[kept], of_p[kept] / (of_p[kept] - of_q[kept])
+    kept = np.flatnonzero((of_p >= 0) != (of_q >= 0))
+    row, slot, of_p, of_q = row[kept], slot[kept], of_p[kept], of_q[kept]
+    a, b, c, p, q = (x.take(kept, axis=1) for x in (a, b, c, p, q))
+    along, to_a, to_b, to_c = q - p, a - p, b - p, c - p
+    of_a, of_b = _cross(along, to_a), _cross(along, to_b)
+    first, second, third = _dot(of_a, to_b) >= 0, _dot(of_b, to_c) >= 0, _dot(of_a, to_c) >= 0
+    kept = np.flatnonzero((first == second) & (first != third))
+    of_p, of_q = of_p[kept], of_q[kept]
+    return row[kept], layout.face[slot[kept]], of_p / (of_p - of_q)
+
+
+def _cross(x, y):
+    out = np.empty_like(x)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        out[k] = x[i] * y[j]
+        out[k] -= x[j] * y[i]
+    return out
 
 
 def _dot(x, y):
