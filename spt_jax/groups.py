@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Integer
@@ -72,7 +71,8 @@ def join_bodies(
     # Faces that are known stay so: what is computed with jnp inside jit is traced.
     if not isinstance(faces, Tracer):
         corners = np.asarray(faces)
-    offsets = (np.arange(bodies) * count).astype(corners.dtype)[:, None, None]
+    corners = corners.astype(np.int32)  # int8 may do for one body and not for all
+    offsets = (np.arange(bodies, dtype=np.int32) * count)[:, None, None]
     return Scene(
         checked.reshape(*batch, bodies * count, 3),
         (corners[None] + offsets).reshape(-1, 3),

@@ -96,7 +96,8 @@ class SurfacePaths:
             part = slice(start, start + 2048)
             to_f, to_g = table.rows[f[part]], table.rows[g[part]]
             near[part] = (to_f + to_g).min(axis=1) < distance - self.slack
-            to_f -= to_g  # inf - inf, at seeds of other parts, is NaN: fmax leaves it out
+            with np.errstate(invalid="ignore"):
+                to_f -= to_g  # NaN, inf - inf, at seeds of other parts: fmax leaves it out
             lower = np.fmax.reduce(np.abs(to_f, out=to_f), axis=1)
             undecided.append(start + np.flatnonzero(~near[part] & (lower < distance + self.slack)))
         rest = np.concatenate(undecided) if undecided else np.zeros(0, int)
