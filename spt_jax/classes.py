@@ -1,7 +1,7 @@
 """Which vertices lie in self-intersection: V_0, V_out and V_in of the paper's Algorithm 1."""
 
 import functools
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from spt_jax.host import call_on_host
 from spt_jax.rays import measure
 from spt_jax.rays.labels import CLEAR, INSIDE, OUT
 from spt_jax.rays.measure import Map, Sampling
+from spt_jax.rays.vertex_winding import vertex_winding
 
 Rule = Literal["vertex", "triangle"]
 
@@ -55,24 +56,37 @@ def classify_vertices(
     *,
     rays: int | tuple[int, int] | str = 512,
     directions: Any = 3,
-    rule: Rule = "triangle",
+    rule: Rule = "vertex",
 ) -> VertexClasses:
-    """Sort the vertices into V_0, V_out and V_in (paper, section 3.2, Algorithm 1).
+    """Sort the vertices into V_0, V_out and V_in (paper, section 3.2).
 
-    A crossing's class is the sign of the winding number on its outer side, so any depth of
-    overlap is classified, where the algorithm's counters stop at two. A triangle's crossings
-    give their class to its three corners; where triangles around a vertex disagree, V_out goes
-    before V_in and both go before V_0. A vertex that no ray reaches is V_0.
+    A vertex's class is the sign of the winding number w_out just outside the surface there: 0 on
+    V_0, more on V_out, less on V_in, for any depth of overlap, where the counters of the paper's
+    Algorithm 1 stop at two.
+
+    The vertex rule finds w_out at the vertex itself, by a ray through it that counts the other
+    triangles in front of it: exact wherever the vertex is not on another sheet. Sheets that
+    touch do not overlap, and of several numbers that are right, at a vertex whose own triangles
+    pass through one another, the nearest to 0 is taken.
+
+    The triangle rule is Algorithm 1's: rays on a lattice give the class of each crossing to the
+    three corners of its triangle; where triangles around a vertex disagree, V_out goes before
+    V_in and both go before V_0. It takes whole triangles at the rim of an overlap, and misses what
+    is between the rays: a vertex that no ray reaches is V_0.
 
     Args:
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
-        rays: rays along the longer side of the screen, or (rows, columns).
-        directions: 1, 3 or the rows of a D x 3 array; a class seen from any of them counts.
-        rule: "triangle", as above.
+        rays: rays along the longer side of the screen, or (rows, columns), for the triangle
+            rule; the vertex rule does not use it.
+        directions: 1, 3 or the rows of a D x 3 array. By the triangle rule a class seen from any
+            of them counts. By the vertex rule one direction decides; the next ones serve the
+            vertices whose ray goes through a hole of the mesh.
+        rule: "vertex" or "triangle", as above.
 
     Returns:
-        The classes; all V_0 where a vertex is not finite.
+        The classes; all V_0 where a vertex is not finite, and V_0 where every ray through the
+        vertex meets a hole.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`.
@@ -92,23 +106,29 @@ def classify_vertices(
         0.5
     """
     vertices, faces = as_mesh(vertices, faces)
-    as_choice("rule", rule, Rule)
-    if rule == "vertex":
-        raise ValueError('rule="vertex" is not in this version: got "vertex"; use "triangle".')
-    return VertexClasses(
-        _labels(Sampling(as_rays(rays), as_directions(directions)), vertices, faces)
-    )
+    sampling = Sampling(as_rays(rays), as_directions(directions))
+    options = _Options(as_choice("rule", rule, Rule), sampling)
+    return VertexClasses(_labels(options, vertices, faces))
+
+
+class _Options(NamedTuple):
+    rule: Rule
+    sampling: Sampling
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _labels(sampling, vertices, faces):
+def _labels(options, vertices, faces):
     results = ((vertices.shape[-2:-1], "int8"),)
-    (label,) = call_on_host(_labels_on_host, sampling, results, vertices, faces)
+    (label,) = call_on_host(_labels_on_host, options, results, vertices, faces)
     return label
 
 
-def _labels_on_host(vertices, faces, sampling: Sampling, map_directions: Map):
+def _labels_on_host(vertices, faces, options: _Options, map_directions: Map):
     if not measure.usable(vertices, faces) or faces.size == 0:
         return (np.zeros(len(vertices), np.int8),)
-    probes = measure.probe(vertices, faces, sampling, map_directions)
+    if options.rule == "vertex":
+        directions = np.array(options.sampling.directions)
+        winding = vertex_winding(vertices, faces, directions)
+        return (np.sign(winding).astype(np.int8),)
+    probes = measure.probe(vertices, faces, options.sampling, map_directions)
     return (measure.labels(faces, len(vertices), probes),)

@@ -1,4 +1,4 @@
-"""V_0, V_out and V_in: Algorithm 1's triangle rule, its precedence and the ratio."""
+"""V_0, V_out and V_in: Algorithm 1's triangle rule, and both rules as users call them."""
 
 import jax
 import jax.numpy as jnp
@@ -115,13 +115,14 @@ def test_body_against_the_exact_winding_number():
     assert np.mean(label[~one_ring] == 0) > 0.99
 
 
+@pytest.mark.parametrize("rule", ["vertex", "triangle"])
 @pytest.mark.parametrize("shape", [(), (3,), (2, 2)])
-def test_batches_and_masks(dtype, shape):
+def test_batches_and_masks(dtype, shape, rule):
     vertices, faces = join(box(), box((0.5, 0.5, 0.5)))
     batch = jnp.broadcast_to(jnp.asarray(vertices, dtype), (*shape, *vertices.shape))
     for classes in (
-        classify_vertices(batch, faces, rays=64),
-        jax.jit(lambda v: classify_vertices(v, faces, rays=64))(batch),
+        classify_vertices(batch, faces, rays=64, rule=rule),
+        jax.jit(lambda v: classify_vertices(v, faces, rays=64, rule=rule))(batch),
     ):
         assert isinstance(classes, VertexClasses)
         assert classes.label.dtype == jnp.int8 and classes.label.shape == batch.shape[:-1]
@@ -132,15 +133,35 @@ def test_batches_and_masks(dtype, shape):
         np.testing.assert_array_equal(classes.clear, ~classes.out)
 
 
-def test_classes_of_unusable_vertices_are_clear():
+def test_the_vertex_rule_is_the_default_and_is_exact_at_the_rim():
+    """A box half immersed: by the vertex rule its far corners are clear, by the other no longer."""
+    vertices, faces = join(box(), box((0.5, 0.5, 0.5), (0.5, 0.01, 0.02)))
+    vertices = jnp.asarray(vertices, "float32")
+    inner = np.arange(8, 16)[np.asarray(vertices[8:, 0]) < 0.5]
+    label = classify_vertices(vertices, faces).label
+    np.testing.assert_array_equal(np.flatnonzero(label), inner)
+    np.testing.assert_array_equal(label[inner], 1)
+    np.testing.assert_array_equal(classify_vertices(vertices, faces, rays=1).label, label)
+    whole = classify_vertices(vertices, faces, rule="triangle").out
+    assert whole[inner].all() and whole.sum() > len(inner)
+
+
+@pytest.mark.parametrize("rule", ["vertex", "triangle"])
+def test_w_out_below_zero_is_inside(rule):
+    vertices, faces = join(inverted(box()), box(center=(3, 0, 0)))
+    classes = classify_vertices(jnp.asarray(vertices, "float32"), faces, rays=64, rule=rule)
+    np.testing.assert_array_equal(classes.label, [-1] * 8 + [0] * 8)
+    np.testing.assert_array_equal(classes.inside, classes.label == -1)
+
+
+@pytest.mark.parametrize("rule", ["vertex", "triangle"])
+def test_classes_of_unusable_vertices_are_clear(rule):
     vertices, faces = join(box(), box((0.5, 0.5, 0.5)))
     vertices[3, 1] = np.nan
-    label = classify_vertices(jnp.asarray(vertices, "float32"), faces).label
+    label = classify_vertices(jnp.asarray(vertices, "float32"), faces, rule=rule).label
     np.testing.assert_array_equal(label, 0)
 
 
-def test_the_vertex_rule_says_that_it_is_missing(untyped):
-    with pytest.raises(ValueError, match="rule"):
-        classify_vertices(jnp.zeros((3, 3)), np.array([[0, 1, 2]]), rule="vertex")
+def test_unknown_rules_are_refused(untyped):
     with pytest.raises(ValueError, match="rule must be one of 'vertex', 'triangle': got 'edge'"):
         classify_vertices(jnp.zeros((3, 3)), np.array([[0, 1, 2]]), rule="edge")
