@@ -5,6 +5,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 # Triangles to a cluster, and clusters to a group. On the posed body 4 make 33,000 pairs of clusters
@@ -52,6 +53,8 @@ class Layout:
         face: the face in each slot, 0 in empty ones.
         empty: the empty slots.
         corners: the vertices of the face in each slot, by number.
+        corners_32: the same in half the bytes, to compare them faster.
+        at_vertices: (V, S), adds up at each vertex what belongs to the triangles around it.
         sense: 1 where that is their order in the face, too, as a cycle; else -1.
         apart: pairs of slots of one cluster, where the faces share no vertex.
     """
@@ -60,6 +63,8 @@ class Layout:
     slot: Int[np.ndarray, "F"]
     empty: Int[np.ndarray, "P"]
     corners: Int[np.ndarray, "3 S"]
+    corners_32: Int[np.ndarray, "3 S"]
+    at_vertices: scipy.sparse.csr_array
     sense: Float[np.ndarray, "S"]
     apart: Int[np.ndarray, "2 N"]
 
@@ -76,7 +81,7 @@ class Prepared:
     def arrange(self, box: Float[np.ndarray, "F 6"]) -> Layout:
         """A new layout, for this shape (each face's lowest and highest corner) and earlier ones."""
         self.shapes = [*self.shapes[1 - _KEPT_SHAPES :], box]
-        self.layout = _arrange(self.topology.faces, self.shapes)
+        self.layout = _arrange(self.topology, self.shapes)
         return self.layout
 
 
@@ -138,8 +143,9 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     )
 
 
-def _arrange(faces: Int[np.ndarray, "F 3"], boxes: list[Float[np.ndarray, "F 6"]]) -> Layout:
+def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layout:
     """Halve the faces, by their places in all the shapes, until clusters are left."""
+    faces = topology.faces
     place = np.concatenate([box[:, :3] + box[:, 3:] for box in boxes], axis=1).T
     size = (boxes[-1][:, 3:] - boxes[-1][:, :3]).max(axis=1)
     # A triangle eight times the usual size would blow up the box of any cluster it is put into.
@@ -190,6 +196,11 @@ def _arrange(faces: Int[np.ndarray, "F 3"], boxes: list[Float[np.ndarray, "F 6"]
         slot=slot,
         empty=empty,
         corners=corners,
+        corners_32=corners.astype(np.int32),
+        at_vertices=scipy.sparse.csr_array(
+            (np.ones(faces.size), slot[topology.fan // 3], topology.fan_start),
+            shape=(len(topology.closed), len(face)),
+        ),
         sense=np.where(turns == 2, 1.0, -1.0),
         apart=np.stack([CLUSTER * cluster + first[pair], CLUSTER * cluster + second[pair]]),
     )

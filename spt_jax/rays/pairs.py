@@ -197,7 +197,7 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: _Shape):
     Then they do not overlap. Ties of x_k are broken by vertex number, as if moved by nothing.
     """
     count = points.shape[1]
-    d = np.stack([sum(np.bincount(at, n, count) for at in layout.corners) for n in shape.normal])
+    d = np.stack([layout.at_vertices @ n for n in shape.normal])
     axis = np.abs(d).argmin(axis=0)
     every = np.arange(count)
     d[axis, every] = 0.0
@@ -286,7 +286,10 @@ def _meeting_members(low, high, a, b):
     for part in _parts(np.full(len(a), CLUSTER * CLUSTER)):
         p, q = a[part], b[part]
         meet = _meet(
-            low[p][:, :, None], high[p][:, :, None], low[q][:, None, :], high[q][:, None, :]
+            low.take(p, axis=0)[:, :, None],
+            high.take(p, axis=0)[:, :, None],
+            low.take(q, axis=0)[:, None, :],
+            high.take(q, axis=0)[:, None, :],
         )
         meet[p == q] &= _BEFORE
         found = np.flatnonzero(meet)
@@ -313,7 +316,7 @@ def _meeting_triangles(layout: Layout, shape: _Shape, boxes: _Boxes, a, b):
 
 
 def _sharing_none(layout: Layout, t, u):
-    p, q = layout.corners.take(t, axis=1), layout.corners.take(u, axis=1)
+    p, q = layout.corners_32.take(t, axis=1), layout.corners_32.take(u, axis=1)
     shared = p[0] == q[0]
     for i, j in ((0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)):
         shared |= p[i] == q[j]
@@ -329,8 +332,9 @@ def _kept_meeting(shape: _Shape, t, u):
 
 def _reaching(shape: _Shape, boxes: _Boxes, a, b):
     """The triangles of cluster a whose boxes meet the box of b: number of the pair, and slot."""
-    low = shape.low_word.reshape(-1, CLUSTER)[a]
-    high = shape.high_word.reshape(-1, CLUSTER)[a]
+    # Whole rows by take, never by index: five times as fast.
+    low = shape.low_word.reshape(-1, CLUSTER).take(a, axis=0)
+    high = shape.high_word.reshape(-1, CLUSTER).take(a, axis=0)
     found = np.flatnonzero(
         _meet(low, high, boxes.low_word[b][:, None], boxes.high_word[b][:, None])
     )
@@ -344,7 +348,7 @@ def _edges_of_pairs(topology: Topology, layout: Layout, shape: _Shape, t, u):
         x, y = (t, u) if turn else (u, t)
         kept = np.flatnonzero(_straddles(shape, shape.corner.take(x, axis=2), shape.extent[x], y))
         t, u = t[kept], u[kept]
-    row = topology.opposite[layout.face[np.concatenate([t, u])]].ravel()
+    row = topology.opposite.take(layout.face[np.concatenate([t, u])], axis=0).ravel()
     slot = np.repeat(np.concatenate([u, t]), 3)
     kept = np.flatnonzero(row >= 0)
     return row[kept], slot[kept]
