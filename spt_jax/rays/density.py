@@ -27,8 +27,10 @@ _COARSEST, _FINEST = -1, 5
 # same: at most 9 % more than 256 x 256 then.
 MOST_MARKED = 16_000
 
-# A triangle that covers more tiles than this is large: which of its tiles matter is decided tile by
-# tile, by a ray through each and by where other triangles pass through it.
+# A triangle whose bounding box has more tiles than this is large: which of them matter is decided
+# one by one. A tile with overlap lies wholly within it, and the ray through it sees it, or the
+# overlap's outline passes through the tile, and that is made of edges and of the segments along
+# which triangles cross.
 _LARGE = 64
 
 
@@ -70,7 +72,12 @@ def _mark(vertices, faces, sheets, beam, points, size) -> Bool[np.ndarray, "R C"
     if large.any():
         suspect = _filled(shape, top[large], bottom[large], left[large], right[large]) & ~marked
         marked |= _seen(vertices, faces, beam, size, suspect)
-        marked |= _rims(sheets, sheets.faces[large], beam, size, shape)
+        triangles = sheets.faces[large]
+        corner = vertices[faces[triangles]]
+        rims = _segments(sheets, triangles)
+        outline = corner.reshape(-1, 3), np.roll(corner, -1, axis=1).reshape(-1, 3)
+        for start, end in (rims, outline):
+            marked |= _along(start, end, beam, size, shape)
     return marked
 
 
@@ -84,8 +91,8 @@ def _filled(shape, top, bottom, left, right) -> Bool[np.ndarray, "R C"]:
 
 
 def _seen(vertices, faces, fine: Beam, size: int, suspect) -> Bool[np.ndarray, "R C"]:
-    # One ray a tile, and the neighbours of what it sees: an outline that is no rim is a silhouette
-    # and passes within a tile of what lies inside it.
+    # One ray a tile tells whether the tile lies within the overlap; tiles at its outline are found
+    # by the edges and rims that make the outline.
     beam, points = on_lattice(vertices, fine.frame, fine.pixel * size)
     rows, columns = np.indices(beam.shape)
     row, column = (
@@ -102,20 +109,17 @@ def _seen(vertices, faces, fine: Beam, size: int, suspect) -> Bool[np.ndarray, "
     beam = Beam(beam.frame, beam.pixel, beam.origin, beam.shape, coarse)
     kept = cast(beam, points, faces, simple_rays=False)
     overlapped = find_overlaps(beam, points, faces, kept)
-    seen = np.zeros((suspect.shape[0] + 2, suspect.shape[1] + 2), bool)
-    at = beam.locate(np.unique(overlapped.ray))
-    for down in range(3):
-        for across in range(3):
-            seen[row[at] + down, column[at] + across] = True
-    return seen[1:-1, 1:-1]
+    seen = np.zeros(suspect.shape, bool)
+    at = beam.locate(overlapped.ray)
+    seen[row[at], column[at]] = True
+    return seen
 
 
-def _rims(sheets: Sheets, large: Int[np.ndarray, "L"], beam: Beam, size: int, shape):
-    # The segments where triangles pass through large ones, sampled twice a tile.
+def _along(start, end, beam: Beam, size: int, shape) -> Bool[np.ndarray, "R C"]:
+    # Sampled twice a tile, and marked with all neighbours: no tile that a segment enters is missed.
     marked = np.zeros(shape, bool)
-    first, second = _segments(sheets, large)
     start, end = (
-        (points @ beam.frame[:2].T / beam.pixel - beam.origin) / size for points in (first, second)
+        (points @ beam.frame[:2].T / beam.pixel - beam.origin) / size for points in (start, end)
     )
     count = np.ceil(2 * np.abs(end - start).max(axis=1, initial=0)).astype(np.int64) + 2
     segment = np.repeat(np.arange(len(count)), count)

@@ -28,7 +28,7 @@ class Tiles:
         return int(self._before_row[-1]) * self.size**2
 
     @cached_property
-    def _before_row(self) -> Int[np.ndarray, "R+1"]:
+    def _before_row(self) -> Int[np.ndarray, "B"]:
         return np.concatenate([[0], np.cumsum(np.count_nonzero(self.marked, axis=1))])
 
     @cached_property
