@@ -76,7 +76,7 @@ class Prepared:
     topology: Topology
     layout: Layout | None = None
     shapes: list[Float[np.ndarray, "F 6"]] = field(default_factory=list)
-    usual_pairs: int = 0  # of clusters whose boxes meet
+    usual_pairs: int = 0  # of groups whose boxes meet
 
     def arrange(self, box: Float[np.ndarray, "F 6"]) -> Layout:
         """A new layout, for this shape (each face's lowest and highest corner) and earlier ones."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.pair_layout import CLUSTER, Layout, Topology, prepared
+from spt_jax.rays.pair_layout import CLUSTER, Layout, Prepared, Topology, prepared
 
 # Candidates handled at once: bounds the memory at some tens of megabytes for any mesh.
 _CHUNK = 1 << 16
@@ -21,6 +21,7 @@ _CHUNK = 1 << 16
 _FIELD = 21
 _STEPS = (1 << (_FIELD - 1)) - 1
 _GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
+_Pairs = list[tuple[np.ndarray, np.ndarray]]
 _BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
 # Relative to the size of what is multiplied, far above float64's rounding.
 _ROUNDING = 1e-14
@@ -50,24 +51,58 @@ def edge_crossings(
     *,
     among: Bool[np.ndarray, "F"] | None = None,
 ) -> EdgeCrossings:
-    """Every edge that passes through a triangle with which it shares no vertex."""
+    """Every edge that passes through a triangle with which it shares no vertex.
+
+    Edge pq passes through triangle abc where the tetrahedra pabc and qabc have opposite signed
+    volumes and pqab, pqbc and pqca have one sign. A volume of exactly zero counts as positive,
+    in an order of the vertices that does not depend on the triangle; so an edge that touches
+    the common edge of two triangles of a surface passes through one of them or through neither
+    in agreement with its two sides, and triangles without area are passed through by none.
+
+    Args:
+        vertices: positions, in any unit.
+        faces: indices of each triangle's corners. Any triangles will do: open, closed, several
+            to an edge, repeated. What follows from them alone is kept for the next call, for the
+            last few meshes; how fast a call is, but not what it returns, depends on the shapes
+            in which the mesh has been seen.
+        among: faces of interest: only crossings of an edge that belongs to one of them, or that
+            pass through one of them, are returned.
+
+    Returns:
+        The crossings, sorted; none where any vertex is not finite.
+
+    Raises:
+        IndexError: a face does not index into the vertices.
+
+    Example:
+        >>> import numpy as np
+        >>> from spt_jax.rays.pairs import edge_crossings
+        >>> flat = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
+        >>> upright = [[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
+        >>> found = edge_crossings(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
+        >>> print(found.edge.tolist(), found.face, found.point.tolist())
+        [[3, 4], [3, 5]] [0 0] [[1.0, 1.0, 0.0], [1.5, 1.0, 0.0]]
+    """
     nothing = np.zeros(0, np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        return EdgeCrossings(
-            nothing.reshape(0, 2), nothing.reshape(0, 2), nothing, np.zeros((0, 3))
+        pairs = np.zeros((0, 2), np.int64)
+        return EdgeCrossings(pairs, pairs, nothing, np.zeros((0, 3)))
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise IndexError(
+            f"faces must index into vertices: got indices {faces.min()} to {faces.max()} for "
+            f"{len(vertices)} vertices; indices are 0-based."
         )
     mesh = prepared(faces, len(vertices))
     topology = mesh.topology
     # A power of two, so that nothing is rounded: products of three lengths stay in range.
     _, exponent = np.frexp(np.abs(vertices).max())
     points = np.ldexp(vertices.T.astype(np.float64, order="C"), -int(exponent))
-    layout = mesh.layout or mesh.arrange(_face_boxes(points, topology.faces))
-    shape = _shape(points, layout)
     touching = None if among is None else _touching(topology, among)
+    layout, shape, clusters, groups = _near_groups(mesh, points)
     found = list(_around_vertices(points, topology, layout, shape))
-    for t, u in _near_pairs(layout, shape, touching):
+    for t, u in _near_pairs(layout, shape, clusters, groups, touching):
         found.append(_edges_of_pairs(topology, layout, shape, t, u))
-    row, slot = _concatenate(found)
+    row, slot = _concatenate(found) if found else (nothing, nothing)
     row, face, part = _decide(points, topology, layout, row, slot)
     if among is not None:
         kept = _edges_of(topology, among)[topology.edge_id[row]] | among[face]
@@ -75,12 +110,28 @@ def edge_crossings(
     order = np.lexsort((face, row))
     row, face, part = row[order], face[order], part[order]
     ends = topology.ends[row]
-    p, q = vertices[ends[:, 0]], vertices[ends[:, 1]]
+    p, q = np.float64(vertices[ends[:, 0]]), np.float64(vertices[ends[:, 1]])
     return EdgeCrossings(ends, topology.edge_faces[row], face, p + part[:, None] * (q - p))
 
 
 def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
-    """Unique pairs of triangles (the lower first) that cross along some segment."""
+    """Unique pairs of triangles (the lower first) that cross along some segment.
+
+    Args:
+        crossings: what `edge_crossings` found.
+
+    Returns:
+        The triangles of each edge, where it has them, with the triangle that it passes through.
+
+    Example:
+        >>> import numpy as np
+        >>> from spt_jax.rays.pairs import edge_crossings, face_pairs
+        >>> flat = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
+        >>> upright = [[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
+        >>> found = edge_crossings(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
+        >>> print(face_pairs(found))
+        [[0 1]]
+    """
     of_edge = crossings.edge_faces.ravel()
     through = np.repeat(crossings.face, 2)
     kept = of_edge >= 0
@@ -225,10 +276,10 @@ def _medians(x, layout: Layout, count):
     return np.bincount(median, minlength=count + 1)[:-1]
 
 
-def _near_pairs(layout: Layout, shape: _Shape, touching):
+def _near_pairs(layout: Layout, shape: _Shape, clusters: _Boxes, groups: _Pairs, touching):
     """Pairs of slots that share no vertex and whose boxes meet, in parts of bounded size."""
     waiting, size = [], 0
-    for t, u in _all_near_pairs(layout, shape):
+    for t, u in _all_near_pairs(layout, shape, clusters, groups):
         if touching is not None:
             kept = touching[layout.face[t]] | touching[layout.face[u]]
             t, u = t[kept], u[kept]
@@ -245,14 +296,37 @@ def _concatenate(pairs):
     return tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
 
 
-def _all_near_pairs(layout: Layout, shape: _Shape):
+def _all_near_pairs(layout: Layout, shape: _Shape, clusters: _Boxes, groups: _Pairs):
     for part in _parts(np.ones(layout.apart.shape[1], np.int64)):
         yield _kept_meeting(shape, *layout.apart[:, part])
-    clusters = _joined(shape.low, shape.high)
-    groups = _joined(clusters.low, clusters.high)
-    for a, b in _meeting_boxes(groups):
+    for a, b in groups:
         for c, d in _meeting_members(clusters.low_word, clusters.high_word, a, b):
             yield from _meeting_triangles(layout, shape, clusters, c, d)
+
+
+def _near_groups(mesh: Prepared, points):
+    """A layout, the triangles and clusters in it, and the pairs of groups that meet."""
+    layout = mesh.layout
+    fresh = layout is None
+    while True:
+        if layout is None:
+            layout = mesh.arrange(_face_boxes(points, mesh.topology.faces))
+        shape = _shape(points, layout)
+        clusters = _joined(shape.low, shape.high)
+        groups = _joined(clusters.low, clusters.high)
+        # Clusters that were compact once may be strewn all over another shape.
+        limit = 2 * mesh.usual_pairs + len(groups.low_word)
+        pairs, count = [], 0
+        for a, b in _meeting_boxes(groups):
+            pairs.append((a, b))
+            count += len(a)
+            if count > limit and not fresh:
+                break
+        else:
+            if fresh:
+                mesh.usual_pairs = count
+            return layout, shape, clusters, pairs
+        layout, fresh = None, True
 
 
 def _joined(low, high) -> _Boxes:
