@@ -4,7 +4,8 @@ The exact one cuts the triangles along their intersections (libigl's interface t
 the class c = sign(w_out) is constant on every piece. Then the overlap's volume and the boundary
 integral of c lambda are sums over the pieces without any quadrature. On a body it agrees with
 central differences of its own volume to nine digits, and takes 3 s: a third of the time of
-4096 x 4096 rays in three directions, whose gradient is up to 2.4 % off on small overlaps.
+4096 x 4096 rays in three directions. Of 74 frames, those rays have the gradient within 2 % in 67;
+the others overlap by less than 10 cm^3, and below 1e-10 m^3 the error exceeds 100 %.
 """
 
 from collections.abc import Callable
