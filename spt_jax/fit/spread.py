@@ -1,0 +1,127 @@
+"""A surface's vertices as a graph: who is near whom, and forces spread into smooth displacements.
+
+NumPy and SciPy only. All lengths are counted in edges, so that a mesh's fine parts (fingers) and
+coarse parts (trunk) are treated alike, and so that a Laplacian of bad triangles stays well
+conditioned.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from spt_jax.mesh_edges import connected
+
+
+class Surface:
+    """What of a closed mesh depends on its faces alone; made once for many sets of vertices.
+
+    Attributes:
+        faces: without those that list a vertex twice; they have no area.
+        num_vertices: of the mesh.
+        neighbours: (V, V) sparse matrix of ones where two vertices share an edge.
+        laplacian: (V, V), the graph's: degree minus neighbours.
+    """
+
+    def __init__(self, faces: Int[np.ndarray, "F 3"], num_vertices: int):
+        faces = faces.astype(np.int64)
+        degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+        self.faces = faces[~degenerate]
+        self.num_vertices = num_vertices
+        tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
+        links = sparse.coo_matrix(
+            (np.ones(2 * len(tail)), (np.r_[tail, head], np.r_[head, tail])),
+            (num_vertices, num_vertices),
+        ).tocsr()
+        links.data[:] = 1.0
+        self.neighbours: Any = links
+        self.laplacian: Any = sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
+
+    def within(self, start: Int[np.ndarray, "M"], most: int) -> Int[np.ndarray, "_"]:
+        """Vertices at most so many edges away from those of `start`, themselves included."""
+        reached = np.zeros(self.num_vertices, bool)
+        reached[start] = True
+        front = start
+        for _ in range(most):
+            near = np.unique(self.neighbours[front].indices)
+            front = near[~reached[near]]
+            if not len(front):
+                break
+            reached[front] = True
+        return np.flatnonzero(reached)
+
+    def groups(
+        self, used: Bool[np.ndarray, "V"], first: Int[np.ndarray, "K"], second: Int[np.ndarray, "K"]
+    ) -> list[Int[np.ndarray, "_"]]:
+        """The used vertices in groups that hang together by edges or by links first to second."""
+        members = np.flatnonzero(used)
+        if not len(members):
+            return []
+        place = np.full(self.num_vertices, -1)
+        place[members] = np.arange(len(members))
+        edges = self.neighbours[members][:, members].tocoo()
+        label = connected(
+            np.concatenate([edges.row, place[first]]),
+            np.concatenate([edges.col, place[second]]),
+            len(members),
+        )
+        order = np.argsort(label, kind="stable")
+        _, start = np.unique(label[order], return_index=True)
+        return [members[part] for part in np.split(order, start[1:])]
+
+    def edge_length(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
+        """The mean length of the edges at each vertex; zero where there are none."""
+        graph = self.neighbours
+        row = np.repeat(np.arange(self.num_vertices), np.diff(graph.indptr))
+        length = np.linalg.norm(vertices[row] - vertices[graph.indices], axis=1)
+        total = np.bincount(row, length, self.num_vertices)
+        return total / np.maximum(np.diff(graph.indptr), 1)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Forces on some vertices, spread over a patch of the surface: K u = f.
+
+    K = 1 + (s^2 L / 6)^2, with L the graph's Laplacian and s, in edges, how far a force reaches:
+    the thin-plate energy of the displacement (Botsch and Sorkine 2008, "On linear variational
+    surface deformation methods", section 3), next to its plain square. Outside of the patch
+    nothing moves.
+
+    Attributes:
+        surface: the mesh's graph.
+        reach: s of every vertex; zero outside of the patch.
+    """
+
+    surface: Surface
+    reach: Float[np.ndarray, "V"]
+
+    @cached_property
+    def patch(self) -> Int[np.ndarray, "P"]:
+        """The vertices that may move."""
+        return np.flatnonzero(self.reach > 0)
+
+    @cached_property
+    def _factor(self) -> Any:
+        inside = self.patch
+        # All rows of L that a vertex of the patch takes part in, so that the displacement goes to
+        # zero smoothly: at the patch's rim its Laplacian counts too.
+        bend = sparse.diags(self.reach**2 / 6.0) @ self.surface.laplacian[:, inside]
+        form = sparse.identity(len(inside)) + bend.T @ bend
+        # Symmetric and positive definite: no pivoting, which would fill the factors in.
+        return splu(
+            form.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+
+    def __call__(self, forces: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+        """The displacement of every vertex."""
+        moved = np.zeros(forces.shape)
+        if len(self.patch):
+            moved[self.patch] = self._factor.solve(np.ascontiguousarray(forces[self.patch]))
+        return moved
