@@ -9,8 +9,10 @@ def within_cone(
     faces: Int[np.ndarray, "F 3"],
     sample: Int[np.ndarray, "S"],
     step: Float[np.ndarray, "3"],
-) -> Bool[np.ndarray, "S"]:
+) -> tuple[Bool[np.ndarray, "S"], Bool[np.ndarray, "S"]]:
     """Whether a step from the vertex along a unit vector leads to the inner side of its triangles.
+
+    And whether they have an inner side: not on the rim of a hole.
 
     The nearest part of their cone decides by the side that it shows: a triangle, an edge with the
     sum of its normals, or the apex with the sum of all, weighed by their angles (Baerentzen and
@@ -23,8 +25,11 @@ def within_cone(
     corner = np.flatnonzero(of >= 0)
     of, turn = of[corner], corner % 3
     apex = vertices[corners[corner]]
-    e = vertices[corners[corner + np.array([1, 1, -2])[turn]]] - apex
-    f = vertices[corners[corner + np.array([2, -1, -1])[turn]]] - apex
+    after = corners[corner + np.array([1, 1, -2])[turn]]
+    before = corners[corner + np.array([2, -1, -1])[turn]]
+    # Around the vertex what is after it in one triangle is before it in the next.
+    closed = np.bincount(of, after - before, len(sample)) == 0
+    e, f = vertices[after] - apex, vertices[before] - apex
     e /= np.linalg.norm(e, axis=1, keepdims=True)
     f /= np.linalg.norm(f, axis=1, keepdims=True)
     normal = np.cross(e, f)
@@ -40,4 +45,4 @@ def within_cone(
     # Both triangles of an edge have the same distance but for rounding. NaN, of a triangle
     # without area, is nobody's nearest part.
     deciding = (distance <= nearest[of] * (1 + 1e-9)) & np.isfinite(height)
-    return np.bincount(of, np.where(deciding, height, 0.0), len(sample)) < 0
+    return np.bincount(of, np.where(deciding, height, 0.0), len(sample)) < 0, closed

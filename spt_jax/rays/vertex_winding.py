@@ -55,13 +55,15 @@ def vertex_winding(
 ) -> Int[np.ndarray, "V"]:
     """The winding number just outside the mesh's own surface at every vertex, whatever the depth.
 
-    Its sign is the vertex's class: 0 on V_0, +1 on V_out, -1 on V_in. It does not depend on the
-    direction: the first one serves all vertices, the next ones, and then two of our own, those
-    whose ray met a hole, where signs do not cancel. A vertex that no direction decides is 0, and
-    so is one that no triangle uses. Where more than one number is right the one nearest to 0 is
-    taken: a sheet that touches p counts as in front of it or behind it (contact is no overlap),
-    and triangles that wind about p twice as either of their layers. Where no point is outside all
-    of p's triangles, as on a saddle that is folded over, w_out is that of the nearest side.
+    Its sign is the vertex's class: 0 on V_0, +1 on V_out, -1 on V_in. The first direction serves
+    all vertices; the next ones, and then two of our own, those whose ray met a hole, so that signs
+    do not cancel, or only touched the rim of one. A vertex that no direction decides is 0, and
+    so is one that no triangle uses.
+
+    A sheet that touches p counts as in front of it or behind it, whichever brings w_out nearer to
+    0: contact is no overlap. Where p's own triangles pass through one another there are more than
+    two winding numbers around p, and w_out is one whose successor is among them too; only there
+    does it depend on the direction.
     """
     winding = np.zeros(len(vertices), np.int64)
     vertices = vertices.astype(np.float64, copy=False)
@@ -77,9 +79,10 @@ def vertex_winding(
             least += np.minimum(own, 0)
             most += np.maximum(own, 0) - 1
             grazed = np.flatnonzero(own == 0)
-            within = within_cone(vertices, faces, sample[grazed], -frame[2])
+            within, has_sides = within_cone(vertices, faces, sample[grazed], -frame[2])
             least[grazed] -= within
             most[grazed] += ~within
+            total[grazed[~has_sides]] = 1
             closed = np.flatnonzero(total == 0)
             winding[sample[closed]] = np.clip(0, least[closed], most[closed])
             undecided[sample[closed]] = False
