@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import body_faces, box, join, moved, posed_bodies, random_rotation, sphere
 
-from spt_jax.rays import pair_layout, pairs
+from spt_jax.rays import pair_boxes, pair_layout
 from spt_jax.rays.pairs import edge_crossings, face_pairs
 
 
@@ -234,7 +234,7 @@ def test_earlier_shapes_and_threads_change_nothing(rng):
 def test_small_parts_give_what_large_ones_do(rng, monkeypatch):
     mesh = noisy(sphere(subdivisions=3), 0.04, rng)
     expected = found_in(mesh)
-    monkeypatch.setattr(pairs, "_CHUNK", 100)
+    monkeypatch.setattr(pair_boxes, "_CHUNK", 100)
     assert found_in(mesh) == expected != set()
 
 

@@ -100,7 +100,7 @@ def prepared(faces: Int[np.ndarray, "F 3"], count: int) -> Prepared:
             if len(known.closed) == count and np.array_equal(known.faces, faces):
                 _meshes.move_to_end(key)
                 return mesh
-    mesh = Prepared(_topology(faces.copy(), count))
+    mesh = Prepared(_topology(faces.astype(np.int64), count))
     with _lock:
         _meshes[_next_key] = mesh
         _next_key += 1

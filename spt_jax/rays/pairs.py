@@ -7,22 +7,22 @@ that share no vertex are found by boxes: of clusters of neighbours, then of the 
 What is left is decided by signed volumes.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.pair_layout import CLUSTER, Layout, Prepared, Topology, prepared
+from spt_jax.rays.pair_boxes import (
+    Shape,
+    concatenate,
+    cross,
+    near_groups,
+    near_pairs,
+    parts,
+    spread,
+)
+from spt_jax.rays.pair_layout import Layout, Topology, prepared
 
-# Candidates handled at once: bounds the memory at some tens of megabytes for any mesh.
-_CHUNK = 1 << 16
-# A coordinate of a box takes 20 bits and a guard bit: three to a word, six tests to two words.
-_FIELD = 21
-_STEPS = (1 << (_FIELD - 1)) - 1
-_GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
-_Pairs = list[tuple[np.ndarray, np.ndarray]]
-_BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
 # Relative to the size of what is multiplied, far above float64's rounding.
 _ROUNDING = 1e-14
 
@@ -98,11 +98,11 @@ def edge_crossings(
     _, exponent = np.frexp(np.abs(vertices).max())
     points = np.ldexp(vertices.T.astype(np.float64, order="C"), -int(exponent))
     touching = None if among is None else _touching(topology, among)
-    layout, shape, clusters, groups = _near_groups(mesh, points)
+    layout, shape, clusters, groups = near_groups(mesh, points)
     found = list(_around_vertices(points, topology, layout, shape))
-    for t, u in _near_pairs(layout, shape, clusters, groups, touching):
+    for t, u in near_pairs(layout, shape, clusters, groups, touching):
         found.append(_edges_of_pairs(topology, layout, shape, t, u))
-    row, slot = _concatenate(found) if found else (nothing, nothing)
+    row, slot = concatenate(found) if found else (nothing, nothing)
     row, face, part = _decide(points, topology, layout, row, slot)
     if among is not None:
         kept = _edges_of(topology, among)[topology.edge_id[row]] | among[face]
@@ -155,81 +155,22 @@ def _touching(topology: Topology, among):
     return touching
 
 
-@dataclass(frozen=True)
-class _Boxes:
-    """Boxes as whole numbers (3, C), and as words."""
-
-    low: Int[np.ndarray, "3 C"]
-    high: Int[np.ndarray, "3 C"]
-    low_word: Int[np.ndarray, "C"]
-    high_word: Int[np.ndarray, "C"]
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """The triangles in their slots: corners, area normals, boxes as whole numbers and as words."""
-
-    corner: Float[np.ndarray, "3 3 S"]  # axis, corner, slot
-    normal: Float[np.ndarray, "3 S"]
-    extent: Float[np.ndarray, "S"]
-    low: Int[np.ndarray, "3 S"]
-    high: Int[np.ndarray, "3 S"]
-    low_word: Int[np.ndarray, "S"]
-    high_word: Int[np.ndarray, "S"]
-
-
-def _face_boxes(points, faces):
-    corner = points[:, faces]
-    return np.concatenate([corner.min(axis=2), corner.max(axis=2)]).T
-
-
-def _shape(points, layout: Layout) -> _Shape:
-    corner = points.take(layout.corners, axis=1)
-    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
-    normal = _cross(b - a, c - a)
-    normal *= layout.sense
-    normal[:, layout.empty] = 0.0
-    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-    extent = (high - low).sum(axis=0)
-    base = low.min(axis=1, keepdims=True)
-    span = float((high - base).max())
-    scale = _STEPS / span if span > 0 else 0.0
-    # Rounding down keeps the order of any two coordinates, so boxes that meet still do.
-    low = ((low - base) * scale).astype(np.int64)
-    high = ((high - base) * scale).astype(np.int64)
-    low[:, layout.empty] = _STEPS
-    high[:, layout.empty] = 0
-    return _Shape(corner, normal, extent, low, high, _word(low), _word(high) | _GUARDS)
-
-
-def _word(field):
-    return (((field[0] << _FIELD) | field[1]) << _FIELD) | field[2]
-
-
-def _meet(low, high, other_low, other_high):
-    """Whether boxes meet: a guard bit survives where the high end is not below the low one."""
-    first = high - other_low
-    first &= other_high - low
-    first &= _GUARDS
-    return first == _GUARDS
-
-
-def _around_vertices(points, topology: Topology, layout: Layout, shape: _Shape):
+def _around_vertices(points, topology: Topology, layout: Layout, shape: Shape):
     """Candidates (row, slot) whose triangles share the one vertex that is not on the edge."""
     vertex = _uncertain(points, topology, layout, shape)
-    corner, at = _spread(topology.fan_start[vertex], np.diff(topology.fan_start)[vertex])
+    corner, at = spread(topology.fan_start[vertex], np.diff(topology.fan_start)[vertex])
     corner, vertex = topology.fan[corner], vertex[at]
     row = topology.opposite.ravel()[corner]
     kept = np.flatnonzero(row >= 0)
     row, vertex = row[kept], vertex[kept]
     first, count = topology.fan_start[vertex], np.diff(topology.fan_start)[vertex]
-    for part in _parts(count):
-        other, at = _spread(first[part], count[part])
+    for part in parts(count):
+        other, at = spread(first[part], count[part])
         edge, face = row[part][at], topology.fan[other] // 3
         kept = np.flatnonzero(_apart(topology, edge, face))
         edge, slot = edge[kept], layout.slot[face[kept]]
         ends = np.stack([points.take(x, axis=1) for x in topology.ends[edge].T], axis=1)
-        extent = np.abs(ends[:, 1] - ends[:, 0]).sum(axis=0)
+        extent = shape.extent[layout.slot[topology.edge_faces[edge, 0]]]
         kept = np.flatnonzero(_straddles(shape, ends, extent, slot))
         yield edge[kept], slot[kept]
 
@@ -239,7 +180,7 @@ def _apart(topology: Topology, row, face):
     return (ends[:, :, None] != corner[:, None, :]).all(axis=(1, 2))
 
 
-def _uncertain(points, topology: Topology, layout: Layout, shape: _Shape):
+def _uncertain(points, topology: Topology, layout: Layout, shape: Shape):
     """Vertices around which triangles have not been shown to lie side by side.
 
     Let the triangles around a vertex all face a direction d with d_k = 0. Seen along d they turn
@@ -276,147 +217,7 @@ def _medians(x, layout: Layout, count):
     return np.bincount(median, minlength=count + 1)[:-1]
 
 
-def _near_pairs(layout: Layout, shape: _Shape, clusters: _Boxes, groups: _Pairs, touching):
-    """Pairs of slots that share no vertex and whose boxes meet, in parts of bounded size."""
-    waiting, size = [], 0
-    for t, u in _all_near_pairs(layout, shape, clusters, groups):
-        if touching is not None:
-            kept = touching[layout.face[t]] | touching[layout.face[u]]
-            t, u = t[kept], u[kept]
-        waiting.append((t, u))
-        size += len(t)
-        if size > _CHUNK:
-            yield _concatenate(waiting)
-            waiting, size = [], 0
-    if waiting:
-        yield _concatenate(waiting)
-
-
-def _concatenate(pairs):
-    return tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
-
-
-def _all_near_pairs(layout: Layout, shape: _Shape, clusters: _Boxes, groups: _Pairs):
-    for part in _parts(np.ones(layout.apart.shape[1], np.int64)):
-        yield _kept_meeting(shape, *layout.apart[:, part])
-    for a, b in groups:
-        for c, d in _meeting_members(clusters.low_word, clusters.high_word, a, b):
-            yield from _meeting_triangles(layout, shape, clusters, c, d)
-
-
-def _near_groups(mesh: Prepared, points):
-    """A layout, the triangles and clusters in it, and the pairs of groups that meet."""
-    layout = mesh.layout
-    fresh = layout is None
-    while True:
-        if layout is None:
-            layout = mesh.arrange(_face_boxes(points, mesh.topology.faces))
-        shape = _shape(points, layout)
-        clusters = _joined(shape.low, shape.high)
-        groups = _joined(clusters.low, clusters.high)
-        # Clusters that were compact once may be strewn all over another shape.
-        limit = 2 * mesh.usual_pairs + len(groups.low_word)
-        pairs, count = [], 0
-        for a, b in _meeting_boxes(groups):
-            pairs.append((a, b))
-            count += len(a)
-            if count > limit and not fresh:
-                break
-        else:
-            if fresh:
-                mesh.usual_pairs = count
-            return layout, shape, clusters, pairs
-        layout, fresh = None, True
-
-
-def _joined(low, high) -> _Boxes:
-    """The boxes around every `CLUSTER` boxes."""
-    count = low.shape[1] // CLUSTER
-    while low.shape[1] > count:
-        low = np.minimum(low[:, ::2], low[:, 1::2])
-        high = np.maximum(high[:, ::2], high[:, 1::2])
-    return _Boxes(low, high, _word(low), _word(high) | _GUARDS)
-
-
-def _meeting_boxes(boxes: _Boxes):
-    """Pairs of boxes that meet, each with itself too, in parts of bounded size."""
-    axis = int(np.argmax(np.ptp(boxes.low, axis=1)))
-    order = np.argsort(boxes.low[axis])
-    first = boxes.low[axis][order]
-    low, high = boxes.low_word[order], boxes.high_word[order]
-    here = np.arange(len(order))
-    stop = np.searchsorted(first, boxes.high[axis][order], side="right")
-    count = np.maximum(stop - here, 1)
-    for part in _parts(count):
-        b, at = _spread(here[part], count[part])
-        a = at + part.start
-        kept = np.flatnonzero(_meet(low[a], high[a], low[b], high[b]))
-        yield order[a[kept]], order[b[kept]]
-
-
-def _meeting_members(low, high, a, b):
-    """Pairs of the members of a and b that meet, a before b where these are the same."""
-    low, high = low.reshape(-1, CLUSTER), high.reshape(-1, CLUSTER)
-    for part in _parts(np.full(len(a), CLUSTER * CLUSTER)):
-        p, q = a[part], b[part]
-        meet = _meet(
-            low.take(p, axis=0)[:, :, None],
-            high.take(p, axis=0)[:, :, None],
-            low.take(q, axis=0)[:, None, :],
-            high.take(q, axis=0)[:, None, :],
-        )
-        meet[p == q] &= _BEFORE
-        found = np.flatnonzero(meet)
-        pair = found // CLUSTER**2
-        p, q = CLUSTER * p[pair], CLUSTER * q[pair]
-        yield p + found // CLUSTER % CLUSTER, q + found % CLUSTER
-
-
-def _meeting_triangles(layout: Layout, shape: _Shape, boxes: _Boxes, a, b):
-    """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
-    for part in _parts(np.full(len(a), 3 * CLUSTER)):
-        pair_t, t = _reaching(shape, boxes, a[part], b[part])
-        pair_u, u = _reaching(shape, boxes, b[part], a[part])
-        count = np.bincount(pair_u, minlength=len(a[part]))
-        first = (np.cumsum(count) - count)[pair_t]
-        count = count[pair_t]
-        low_t, high_t = shape.low_word[t], shape.high_word[t]
-        low_u, high_u = shape.low_word[u], shape.high_word[u]
-        for piece in _parts(count):
-            second, at = _spread(first[piece], count[piece])
-            at += piece.start
-            kept = np.flatnonzero(_meet(low_t[at], high_t[at], low_u[second], high_u[second]))
-            yield _sharing_none(layout, t[at[kept]], u[second[kept]])
-
-
-def _sharing_none(layout: Layout, t, u):
-    p, q = layout.corners_32.take(t, axis=1), layout.corners_32.take(u, axis=1)
-    shared = p[0] == q[0]
-    for i, j in ((0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)):
-        shared |= p[i] == q[j]
-    kept = np.flatnonzero(~shared)
-    return t[kept], u[kept]
-
-
-def _kept_meeting(shape: _Shape, t, u):
-    low, high = shape.low_word, shape.high_word
-    kept = np.flatnonzero(_meet(low[t], high[t], low[u], high[u]))
-    return t[kept], u[kept]
-
-
-def _reaching(shape: _Shape, boxes: _Boxes, a, b):
-    """The triangles of cluster a whose boxes meet the box of b: number of the pair, and slot."""
-    # Whole rows by take, never by index: five times as fast.
-    low = shape.low_word.reshape(-1, CLUSTER).take(a, axis=0)
-    high = shape.high_word.reshape(-1, CLUSTER).take(a, axis=0)
-    found = np.flatnonzero(
-        _meet(low, high, boxes.low_word[b][:, None], boxes.high_word[b][:, None])
-    )
-    pair = found // CLUSTER
-    return pair, found + CLUSTER * (a[pair] - pair)
-
-
-def _edges_of_pairs(topology: Topology, layout: Layout, shape: _Shape, t, u):
+def _edges_of_pairs(topology: Topology, layout: Layout, shape: Shape, t, u):
     """Candidates (row, slot) of pairs of triangles that neither's plane keeps apart."""
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
@@ -428,7 +229,7 @@ def _edges_of_pairs(topology: Topology, layout: Layout, shape: _Shape, t, u):
     return row[kept], slot[kept]
 
 
-def _straddles(shape: _Shape, points, extent, slot):
+def _straddles(shape: Shape, points, extent, slot):
     """Whether points (3, N, M) lie on both sides of the planes of M triangles, or may."""
     normal, corner = shape.normal.take(slot, axis=1), shape.corner[:, 0].take(slot, axis=1)
     height = normal[0] * (points[0] - corner[0])
@@ -451,43 +252,18 @@ def _decide(points, topology: Topology, layout: Layout, row, slot):
     ends = topology.ends.take(row, axis=0).T
     a, b, c = (points.take(x, axis=1) for x in corner)
     p, q = (points.take(x, axis=1) for x in ends)
-    normal = _cross(b - a, c - a)
+    normal = cross(b - a, c - a)
     of_p, of_q = _dot(normal, p - a), _dot(normal, q - a)
     kept = np.flatnonzero((of_p >= 0) != (of_q >= 0))
     row, slot, of_p, of_q = row[kept], slot[kept], of_p[kept], of_q[kept]
     a, b, c, p, q = (x.take(kept, axis=1) for x in (a, b, c, p, q))
     along, to_a, to_b, to_c = q - p, a - p, b - p, c - p
-    of_a, of_b = _cross(along, to_a), _cross(along, to_b)
+    of_a, of_b = cross(along, to_a), cross(along, to_b)
     first, second, third = _dot(of_a, to_b) >= 0, _dot(of_b, to_c) >= 0, _dot(of_a, to_c) >= 0
     kept = np.flatnonzero((first == second) & (first != third))
     of_p, of_q = of_p[kept], of_q[kept]
     return row[kept], layout.face[slot[kept]], of_p / (of_p - of_q)
 
 
-def _cross(x, y):
-    out = np.empty_like(x)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        out[k] = x[i] * y[j]
-        out[k] -= x[j] * y[i]
-    return out
-
-
 def _dot(x, y):
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
-
-
-def _spread(first, count):
-    """first[i], first[i] + 1, ... (count[i] of them) for each i in turn; and the i of each."""
-    at = np.repeat(np.arange(len(count)), count)
-    return np.arange(len(at)) + (first - np.cumsum(count) + count)[at], at
-
-
-def _parts(count) -> Iterator[slice]:
-    """Slices of the items, such that each slice's counts add up to about `_CHUNK` at most."""
-    total = np.cumsum(count)
-    begin, done = 0, 0
-    while begin < len(total):
-        end = max(begin + 1, int(np.searchsorted(total, done + _CHUNK, side="right")))
-        yield slice(begin, end)
-        begin, done = end, int(total[end - 1])
