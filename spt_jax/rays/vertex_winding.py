@@ -35,7 +35,7 @@ _THINNEST = 1e-7
 # How many strips the screen is cut into, and columns, for each root of the number of vertices.
 # With fewer strips a triangle is paired with more vertices that it cannot contain, with more it
 # is looked up more often: on a body all of 1 to 2 cost the same.
-_STRIPS, _COLUMNS = 1.4, 4.0
+_STRIPS, _COLUMNS = 1.0, 6.0
 
 # Triangles, and pairs of a vertex and a triangle, that are worked on together. So few that memory
 # is used again rather than asked for again, which takes a third off the time; but in proportion
