@@ -190,7 +190,9 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: Shape):
     """
     count = points.shape[1]
     d = np.stack([layout.at_vertices @ n for n in shape.normal])
-    axis = np.abs(d).argmin(axis=0)
+    x, y, z = np.abs(d)
+    # argmin along a short axis takes four times as long.
+    axis = np.where((x <= y) & (x <= z), 0, np.where(y <= z, 1, 2))
     every = np.arange(count)
     d[axis, every] = 0.0
     length = np.abs(d).sum(axis=0)
