@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from spt_jax.rays.pair_layout import CLUSTER, Layout, Prepared
 
-# Candidates handled at once: bounds the memory for any mesh, and half a megabyte an array stays in
-# a processor's second cache.
+# Candidates handled at once: bounds the memory for any mesh. The posed body takes 17 ms with 2^14
+# of them, 12 with 2^16; with 2^18 the memory goes back to the system and is asked for anew.
 _CHUNK = 1 << 16
 # A coordinate of a box takes 20 bits and a guard bit, three to a word: two subtractions of words
 # do the six comparisons of two boxes, and a pair gathers four numbers instead of twelve.

@@ -55,9 +55,9 @@ def edge_crossings(
 
     Edge pq passes through triangle abc where the tetrahedra pabc and qabc have opposite signed
     volumes and pqab, pqbc and pqca have one sign. A volume of exactly zero counts as positive,
-    in an order of the vertices that does not depend on the triangle; so an edge that touches
-    the common edge of two triangles of a surface passes through one of them or through neither
-    in agreement with its two sides, and triangles without area are passed through by none.
+    in an order of the vertices that does not depend on the triangle. So where an edge meets the
+    common edge of two triangles that lie side by side, it passes through exactly one of them;
+    and through triangles without area, or in its own plane, no edge passes.
 
     Args:
         vertices: positions, in any unit.
