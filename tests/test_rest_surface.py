@@ -13,27 +13,22 @@ from spt_jax.rest_surface import RestSurface
 
 
 def slow_distances(vertices, faces, source):
-    """From one triangle's centre to all, by a heap and nothing else."""
-    centre = vertices[faces].mean(axis=1)
+    """From one triangle's corners to the nearest of all others', by a heap and nothing else."""
     ways = [[] for _ in vertices]
-    for a, b, c in faces:
-        for p, q in ((a, b), (b, c), (c, a)):
-            length = np.linalg.norm(vertices[p] - vertices[q])
-            ways[p].append((q, length))
-            ways[q].append((p, length))
+    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    lengths = np.linalg.norm(vertices[starts] - vertices[ends], axis=1)
+    for p, q, length in zip(starts.tolist(), ends.tolist(), lengths.tolist(), strict=True):
+        ways[p].append((q, length))
+        ways[q].append((p, length))
     to = np.full(len(vertices), np.inf)
-    heap = [(np.linalg.norm(vertices[v] - centre[source]), v) for v in faces[source]]
-    heapq.heapify(heap)
+    heap = [(0.0, v) for v in faces[source].tolist()]
     while heap:
         length, v = heapq.heappop(heap)
         if length < to[v]:
             to[v] = length
             for w, further in ways[v]:
                 heapq.heappush(heap, (length + further, w))
-    last = np.linalg.norm(vertices[faces] - centre[:, None], axis=2)
-    total = (to[faces] + last).min(axis=1)
-    total[source] = 0
-    return total
+    return to[faces].min(axis=1)
 
 
 # Two pieces, a vertex that no triangle uses, and two vertices at one place.
@@ -74,9 +69,33 @@ def test_distances_are_close_symmetric_and_infinite_between_pieces():
     assert got.dtype == np.float32
     same = np.isfinite(true)
     assert np.abs(got[same] - true[same]).max() < 0.15
-    assert np.abs(got[same] - true[same]).mean() < 0.03
+    assert np.abs(got[same] - true[same]).mean() < 0.04
     np.testing.assert_array_equal(rest.between_faces(g, f), got)
     np.testing.assert_array_equal(rest.near(f, g), got < 0.3)
+
+
+@pytest.mark.parametrize("seeds", [12, 512])
+def test_bounds_hold_the_distance_between_them(seeds, monkeypatch):
+    monkeypatch.setattr(surface_paths, "_SEEDS", seeds)
+    surface_paths._shared.cache_clear()
+    rest = RestSurface(*PAIR)
+    sources = np.arange(3, rest.num_faces, 173)
+    true = np.concatenate([slow_distances(*PAIR, s) for s in sources])
+    lower, upper = rest._bounds(*all_pairs(sources, rest.num_faces))
+    assert (lower >= 0).all()
+    assert (lower <= true + 1e-5).all() and (true <= upper + 1e-5).all()
+    surface_paths._shared.cache_clear()
+
+
+def test_triangles_with_a_common_corner_have_no_distance():
+    vertices, faces = sphere(0.3, subdivisions=2)
+    f, g = all_pairs(np.arange(len(faces)), len(faces))
+    touch = (faces[f][:, :, None] == faces[g][:, None]).any(axis=(1, 2))
+    shortest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).min()
+    for distance in (1e-9, 0.99 * shortest):
+        rest = RestSurface(vertices, faces, distance)
+        np.testing.assert_array_equal(rest.near(f, g, exact=True), touch)
+    assert not RestSurface(vertices, faces, 0.0).near(f, g, exact=True).any()
 
 
 def test_the_embedded_body_is_as_close_as_documented():
@@ -84,9 +103,9 @@ def test_the_embedded_body_is_as_close_as_documented():
     rest = body.rest_surface
     vertices, faces = np.asarray(body.template, np.float64), body_faces()
     assert rest.num_faces == len(faces) and rest.distance == 0.3
-    source = 7000
-    true = slow_distances(vertices, faces, source)
-    f, g = all_pairs([source], len(faces))
+    sources = [7000, 20000]
+    true = np.concatenate([slow_distances(vertices, faces, source) for source in sources])
+    f, g = all_pairs(sources, len(faces))
     error = np.abs(rest.between_faces(f, g) - true)
     assert error.max() < 0.05 and error.mean() < 0.012
     np.testing.assert_array_equal(rest.near(f, g, exact=True), true < 0.3)
