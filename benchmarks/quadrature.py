@@ -9,7 +9,7 @@ from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.untangle import LEAST_OVERLAP, colliding_frames
 from spt_jax import load_body, load_mocap
 from spt_jax.arguments import as_directions
-from spt_jax.rays import measure
+from spt_jax.rays.measure import Sampling, measure
 
 REFERENCE_RAYS = 2048
 
@@ -36,14 +36,7 @@ def main(settings: Settings) -> None:
             pose = body.pose_from_smpl(mocap.pose[frame])
             vertices = np.asarray(body(pose).vertices, np.float64)
             fine, plain = (
-                np.array(
-                    [
-                        found.volume
-                        for found in measure.probe(
-                            vertices, faces, measure.Sampling(rays, as_directions(3))
-                        )
-                    ]
-                )
+                np.array(measure(vertices, faces, Sampling(rays, as_directions(3))).volumes)
                 for rays in (REFERENCE_RAYS, settings.rays)
             )
             reference = fine.mean()

@@ -1,7 +1,7 @@
 """Which vertices lie in self-intersection: V_0, V_out and V_in of the paper's Algorithm 1."""
 
 import functools
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int8, Integer
 
 from spt_jax.arguments import as_choice, as_directions, as_mesh, as_rays
+from spt_jax.exclusions import as_exclusions
 from spt_jax.host import call_on_host
-from spt_jax.rays import measure
+from spt_jax.rays.exclusions import Exclusions
 from spt_jax.rays.labels import CLEAR, INSIDE, OUT
-from spt_jax.rays.measure import Map, Sampling
-from spt_jax.rays.vertex_winding import vertex_winding
-
-Rule = Literal["vertex", "triangle"]
+from spt_jax.rays.measure import Rule, Sampling, measure, usable
+from spt_jax.rays.sheets import Map
+from spt_jax.rest_surface import RestSurface
 
 
 class VertexClasses(eqx.Module):
@@ -54,9 +54,12 @@ def classify_vertices(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
     faces: Integer[Array, "F 3"] | np.ndarray,
     *,
-    rays: int | tuple[int, int] | str = 512,
+    rays: int | tuple[int, int] | str = "auto",
     directions: Any = 3,
     rule: Rule = "vertex",
+    face_groups: Integer[Array, "F"] | np.ndarray | None = None,
+    ignore_groups: Any = (),
+    folds: RestSurface | None = None,
 ) -> VertexClasses:
     """Sort the vertices into V_0, V_out and V_in (paper, section 3.2).
 
@@ -77,12 +80,16 @@ def classify_vertices(
     Args:
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
-        rays: rays along the longer side of the screen, or (rows, columns), for the triangle
-            rule; the vertex rule does not use it.
+        rays: for the triangle rule: "auto", no rays at all, every triangle that lies in an overlap
+            anywhere; rays along the longer side of the screen; or (rows, columns). The vertex rule
+            does not use it.
         directions: 1, 3 or the rows of a D x 3 array. By the triangle rule a class seen from any
             of them counts. By the vertex rule one direction decides; the next ones serve the
             vertices whose ray goes through a hole of the mesh.
         rule: "vertex" or "triangle", as above.
+        face_groups, ignore_groups, folds: overlaps that do not count, as in
+            `self_intersection_penalty`; their vertices are V_0. Each connected overlap counts
+            whole or not at all.
 
     Returns:
         The classes; all V_0 where a vertex is not finite, and V_0 where every ray through the
@@ -107,13 +114,15 @@ def classify_vertices(
     """
     vertices, faces = as_mesh(vertices, faces)
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    options = _Options(as_choice("rule", rule, Rule), sampling)
+    exclusions = as_exclusions(face_groups, ignore_groups, folds, faces.shape[0])
+    options = _Options(as_choice("rule", rule, Rule), sampling, exclusions)
     return VertexClasses(_labels(options, vertices, faces))
 
 
 class _Options(NamedTuple):
     rule: Rule
     sampling: Sampling
+    exclusions: Exclusions
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -123,12 +132,8 @@ def _labels(options, vertices, faces):
     return label
 
 
-def _labels_on_host(vertices, faces, options: _Options, map_directions: Map):
-    if not measure.usable(vertices, faces) or faces.size == 0:
+def _labels_on_host(vertices, faces, options: _Options, map_tasks: Map):
+    if not usable(vertices, faces) or faces.size == 0:
         return (np.zeros(len(vertices), np.int8),)
-    if options.rule == "vertex":
-        directions = np.array(options.sampling.directions)
-        winding = vertex_winding(vertices, faces, directions)
-        return (np.sign(winding).astype(np.int8),)
-    probes = measure.probe(vertices, faces, options.sampling, map_directions)
-    return (measure.labels(faces, len(vertices), probes),)
+    found = measure(vertices, faces, options.sampling, options.exclusions, map_tasks)
+    return (found.labels(options.rule),)

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Int, Int8
 
-from spt_jax.arguments import as_directions, as_rays
+from spt_jax.arguments import as_choice, as_directions, as_rays
+from spt_jax.exclusions import as_exclusions
 from spt_jax.host import parallel_map
 from spt_jax.mesh_check import one_mesh
-from spt_jax.rays import measure
 from spt_jax.rays.beam import Rays
 from spt_jax.rays.labels import CLEAR, INSIDE, OUT
-from spt_jax.rays.measure import Sampling
+from spt_jax.rays.measure import Rule, Sampling, measure
+from spt_jax.rest_surface import RestSurface
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,22 +21,28 @@ class IntersectionReport:
     """How much of a mesh is in self-intersection; printing it shows a table.
 
     Attributes:
-        volume: the overlap volume, in the cube of the mesh's unit: the mean over the directions.
+        volume: the overlap volume that counts, in the cube of the mesh's unit: the mean over the
+            directions.
+        total_volume: the same with what does not count: folds and ignored groups.
         solid_volume: what the surface encloses, each overlap counted as often as it is covered:
             the integral of the winding number.
         directions: of the beams, unit vectors.
-        volumes: the overlap volume that each beam sees.
+        volumes: the overlap volume that each direction gives; all the same where no rays were
+            needed.
         labels: 0 on V_0, +1 on V_out, -1 on V_in, as `classify_vertices`.
-        rays: rays along the longer side of each screen, or (rows, columns), as asked for.
-        crossings: of rays with triangles, for each beam.
+        crossing_pairs: pairs of triangles that pass through each other and count, and in all.
+        rays: "auto", rays along the longer side of each screen, or (rows, columns), as asked for.
+        crossings: of rays with triangles, for each beam; none where no rays were needed.
         open_rays: rays of each beam that met a hole and were left out.
     """
 
     volume: float
+    total_volume: float
     solid_volume: float
     directions: tuple[tuple[float, float, float], ...]
     volumes: tuple[float, ...]
     labels: Int8[np.ndarray, "V"]
+    crossing_pairs: tuple[int, int]
     rays: Rays
     crossings: tuple[int, ...]
     open_rays: tuple[int, ...]
@@ -62,13 +69,15 @@ class IntersectionReport:
 
     @property
     def intersects(self) -> bool:
-        """Whether any ray sees an overlap."""
+        """Whether there is an overlap that counts."""
         return self.volume > 0
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the labels, as JSON types; volumes in the cube of the mesh's unit."""
         return {
             "volume": self.volume,
+            "total_volume": self.total_volume,
+            "crossing_pairs": {"counted": self.crossing_pairs[0], "all": self.crossing_pairs[1]},
             "solid_volume": self.solid_volume,
             "ratio": self.ratio,
             "vertices": {"out": self.num_out, "in": self.num_inside, "clear": self.num_clear},
@@ -76,7 +85,7 @@ class IntersectionReport:
             "beams": [
                 {"direction": list(d), "volume": v, "crossings": n, "open_rays": o}
                 for d, v, n, o in zip(
-                    self.directions, self.volumes, self.crossings, self.open_rays, strict=True
+                    self.directions, self.volumes, self.crossings, self.open_rays, strict=False
                 )
             ],
         }
@@ -97,13 +106,18 @@ class IntersectionReport:
         # A mesh does not say what its unit is, so the cube is of "the unit", never of a metre.
         table = Table.grid(padding=(0, 2))
         table.add_row("overlap volume", f"{self.volume:.4g} unit³{share}")
+        if self.total_volume != self.volume or self.crossing_pairs[0] != self.crossing_pairs[1]:
+            table.add_row("with what does not count", f"{self.total_volume:.4g} unit³")
         table.add_row("solid volume", f"{self.solid_volume:.4g} unit³")
         table.add_row("ratio (Eq. 11)", f"{self.ratio:.3%} of {len(self.labels)} vertices")
         table.add_row(
             "vertices", f"{self.num_out} V_out, {self.num_inside} V_in, {self.num_clear} V_0"
         )
+        counted, pairs = self.crossing_pairs
+        ignored = f", {pairs - counted} more that do not count" if pairs > counted else ""
+        table.add_row("crossing triangles", f"{counted} pairs{ignored}")
         for direction, volume, crossings, lost in zip(
-            self.directions, self.volumes, self.crossings, self.open_rays, strict=True
+            self.directions, self.volumes, self.crossings, self.open_rays, strict=False
         ):
             axis = _axis_name(direction)
             note = f", [red]{lost} rays through a hole left out[/red]" if lost else ""
@@ -115,21 +129,26 @@ def intersection_report(
     vertices: Float[Array, "V 3"] | np.ndarray,
     faces: Int[Array, "F 3"] | np.ndarray,
     *,
-    rays: int | tuple[int, int] | str = 512,
+    rays: int | tuple[int, int] | str = "auto",
     directions: Any = 3,
+    rule: Rule = "vertex",
+    face_groups: Int[Array, "F"] | np.ndarray | None = None,
+    ignore_groups: Any = (),
+    folds: RestSurface | None = None,
 ) -> IntersectionReport:
     """What the penalty sees on one mesh: volume, ratio, classes, and how far to trust them.
 
     The numbers are those of `self_intersection_penalty` and `classify_vertices`, measured in
-    float64 whatever the dtype of the vertices. The spread between directions tells the error of
-    the volume; rays through a hole say that the mesh is not closed (`check_mesh` says where to
-    begin).
+    float64 whatever the dtype of the vertices. Where rays are cast, the spread between directions
+    tells the error of the volume, and rays through a hole say that the mesh is not closed
+    (`check_mesh` says where to begin).
 
     Args:
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
-        rays: rays along the longer side of the screen, or (rows, columns).
-        directions: 1, 3 or the rows of a D x 3 array.
+        rays, directions: as in `self_intersection_penalty`.
+        rule: how the vertices are classed, as in `classify_vertices`.
+        face_groups, ignore_groups, folds: what does not count, as in `self_intersection_penalty`.
 
     Returns:
         The report; `print` shows it as a table, `as_dict()` is ready for JSON.
@@ -158,16 +177,20 @@ def intersection_report(
             "remove or restore them."
         )
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    beams = measure.probe(points, triangles, sampling, parallel_map) if len(triangles) else []
+    exclusions = as_exclusions(face_groups, ignore_groups, folds, len(triangles))
+    wanted = as_choice("rule", rule, Rule)
+    found = measure(points, triangles, sampling, exclusions, parallel_map)
     return IntersectionReport(
-        volume=measure.volume(beams) if beams else 0.0,
+        volume=found.volume,
+        total_volume=found.total_volume,
         solid_volume=_solid_volume(points, triangles),
         directions=sampling.directions,
-        volumes=tuple(float(beam.volume) for beam in beams) or (0.0,) * len(sampling.directions),
-        labels=measure.labels(triangles, len(points), beams),
+        volumes=tuple(found.volumes),
+        labels=found.labels(wanted),
+        crossing_pairs=(found.crossing_pairs, len(found.sheets.pairs)),
         rays=sampling.rays,
-        crossings=tuple(b.crossings for b in beams) or (0,) * len(sampling.directions),
-        open_rays=tuple(b.open_rays for b in beams) or (0,) * len(sampling.directions),
+        crossings=tuple(beam.crossings for beam in found.beams),
+        open_rays=tuple(beam.open_rays for beam in found.beams),
     )
 
 

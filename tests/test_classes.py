@@ -19,14 +19,13 @@ from helpers import (
 )
 
 from spt_jax import VertexClasses, classify_vertices
-from spt_jax.rays import measure
 from spt_jax.rays.labels import triangle_labels
 from spt_jax.rays.levels import Overlaps
+from spt_jax.rays.measure import measure
 
 
 def labels(mesh, rays=256, directions=3):
-    probes = measure.probe(*mesh, sampling(rays, directions))
-    return measure.labels(mesh[1], len(mesh[0]), probes)
+    return measure(*mesh, sampling(rays, directions)).labels("triangle")
 
 
 def algorithm_1(mesh, direction, rays):

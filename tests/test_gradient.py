@@ -17,21 +17,21 @@ from helpers import (
     sphere,
 )
 
-from spt_jax.rays import measure
 from spt_jax.rays.boundary import vertex_gradient
+from spt_jax.rays.measure import measure
 
 
 def value_and_gradient(mesh, rays, directions=3, kind="boundary"):
-    probes = measure.probe(*mesh, sampling(rays, directions))
-    return measure.volume(probes), measure.gradient(*mesh, probes, kind)
+    found = measure(*mesh, sampling(rays, directions))
+    return found.volume, found.gradient(kind, "triangle")
 
 
 def on_fixed_rays(mesh, rays, direction):
     """The volume as a function of the vertices; the lattice must not change its pixel."""
-    pixel = measure.probe(*mesh, sampling(rays, [direction]))[0].beam.pixel
+    pixel = measure(*mesh, sampling(rays, [direction])).beams[0].beam.pixel
 
     def function(vertices):
-        (found,) = measure.probe(vertices, mesh[1], sampling(rays, [direction]))
+        (found,) = measure(vertices, mesh[1], sampling(rays, [direction])).beams
         np.testing.assert_array_equal(found.beam.pixel, pixel)
         return found.volume
 

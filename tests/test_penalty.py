@@ -79,7 +79,7 @@ def test_the_paper_s_pair(dtype, gradient):
     value, slope = jax.value_and_grad(
         lambda v: paper_penalty(v, FACES, rays=64, normalize=gradient == "unit")
     )(vertices)
-    classes = classify_vertices(vertices, FACES, rays=64, directions=1)
+    classes = classify_vertices(vertices, FACES, rays=64, directions=1, rule="triangle")
     assert value == pytest.approx(float(classes.ratio), rel=1e-6)
     assert 0.05 < value < 0.5
     norm = np.linalg.norm(slope, axis=1)

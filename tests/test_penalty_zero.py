@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spt_jax import self_intersection_penalty
-from spt_jax.rays import measure
+from spt_jax.rays.measure import measure
 
 
 @pytest.mark.parametrize("value", ["volume", "ratio"])
@@ -64,9 +64,9 @@ def test_convex_solids_never_overlap(mesh, rays, noise, scale, directions, seed)
     corner = rng.choice(mesh[0])
     vertices = (mesh[0] - corner * rng.integers(0, 2)) * scale
     vertices = vertices + noise * rng.normal(size=vertices.shape)
-    probes = measure.probe(vertices, mesh[1], sampling(rays, directions))
-    assert measure.volume(probes) == 0
-    assert not measure.labels(mesh[1], len(vertices), probes).any()
+    found = measure(vertices, mesh[1], sampling(rays, directions))
+    assert found.volume == 0
+    assert not found.labels("triangle").any()
 
 
 def test_bodies_that_ipctk_calls_free_are_exactly_free():

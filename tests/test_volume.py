@@ -21,17 +21,17 @@ from helpers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spt_jax.rays import measure
+from spt_jax.rays.measure import measure
 
 FINE = 512
 
 
 def volume(mesh, rays=FINE, directions=3) -> float:
-    return measure.volume(measure.probe(*mesh, sampling(rays, directions)))
+    return measure(*mesh, sampling(rays, directions)).volume
 
 
 def volumes(mesh, rays=FINE, directions=3):
-    return np.array([p.volume for p in measure.probe(*mesh, sampling(rays, directions))])
+    return np.array(measure(*mesh, sampling(rays, directions)).volumes)
 
 
 SOLIDS = {

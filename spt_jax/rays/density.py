@@ -1,4 +1,4 @@
-"""`rays="auto"`: fine rays around the overlaps, and none elsewhere.
+"""`rays="auto"`, where the closed form does not apply: fine rays around overlaps, none elsewhere.
 
 The screen is cut into tiles. Every tile that a triangle with class not 0 touches is marked, and
 rays are cast in marked tiles alone. An overlap is bounded by such triangles, so nothing is lost:
@@ -31,7 +31,7 @@ MOST_MARKED = 16_000
 # one by one. A tile with overlap lies wholly within it, and the ray through it sees it, or the
 # overlap's outline passes through the tile, and that is made of edges and of the segments along
 # which triangles cross.
-_LARGE = 64
+_LARGE = 256
 
 
 def aim_at_sheets(
@@ -39,15 +39,16 @@ def aim_at_sheets(
     faces: Int[np.ndarray, "F 3"],
     direction: Float[np.ndarray, "3"],
     sheets: Sheets,
+    bounding: Int[np.ndarray, "H"],
 ) -> tuple[Beam, ScreenPoints]:
-    """A beam through the tiles of the screen where the sheets overlap, as fine as it may be."""
+    """A beam through the tiles that some of the bounding triangles touch, as fine as it may be."""
     frame = turned_frame(direction)
     pixel = square_pixel(vertices, direction, BASE_RAYS)
 
     def aim(refinement: int) -> tuple[Beam, ScreenPoints]:
         size = int(_TILE * 2.0**refinement)
         beam, points = on_lattice(vertices, frame, pixel / 2.0**refinement, size)
-        marked = _mark(vertices, faces, sheets, beam, points, size)
+        marked = _mark(vertices, faces, sheets, bounding, beam, points, size)
         return Beam(beam.frame, beam.pixel, beam.origin, beam.shape, Tiles(size, marked)), points
 
     beam, points = aim(0)
@@ -57,10 +58,10 @@ def aim_at_sheets(
     return aim(refinement) if refinement else (beam, points)
 
 
-def _mark(vertices, faces, sheets, beam, points, size) -> Bool[np.ndarray, "R C"]:
+def _mark(vertices, faces, sheets, bounding, beam, points, size) -> Bool[np.ndarray, "R C"]:
     shape = tuple(-(-side // size) for side in beam.shape)
     marked = np.zeros(shape, bool)
-    top, bottom, left, right = boxes(points.row, points.column, size, shape, faces[sheets.faces])
+    top, bottom, left, right = boxes(points.row, points.column, size, shape, faces[bounding])
     rows, columns = bottom - top + 1, right - left + 1
     large = rows * columns > _LARGE
     small = np.flatnonzero(~large)
@@ -72,7 +73,7 @@ def _mark(vertices, faces, sheets, beam, points, size) -> Bool[np.ndarray, "R C"
     if large.any():
         suspect = _filled(shape, top[large], bottom[large], left[large], right[large]) & ~marked
         marked |= _seen(vertices, faces, beam, size, suspect)
-        triangles = sheets.faces[large]
+        triangles = bounding[large]
         corner = vertices[faces[triangles]]
         rims = _segments(sheets, triangles)
         outline = corner.reshape(-1, 3), np.roll(corner, -1, axis=1).reshape(-1, 3)

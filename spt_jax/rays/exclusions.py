@@ -59,15 +59,29 @@ class Exclusions(NamedTuple):
 NOTHING = Exclusions()
 
 
-def counted_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
-    """Which regions of overlap count: those without a rim, and those whose rim has a collision."""
+def colliding_pairs(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "P"]:
+    """Which of the triangles that pass through each other collide, by groups and rest distance."""
     f, g = sheets.pairs.T
     collides = ~_ignored(exclusions, f, g)
     if exclusions.rest is not None:
         collides &= ~exclusions.rest.near(f, g, exact=True)
-    region = sheets.region[f]
+    return collides
+
+
+def counted_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
+    """Which regions of overlap count: those without a rim, and those whose rim has a collision."""
+    region = sheets.region[sheets.pairs[:, 0]]
     rim = np.bincount(region, minlength=sheets.num_regions)
+    collides = colliding_pairs(exclusions, sheets)
     return (rim == 0) | (np.bincount(region, collides, sheets.num_regions) > 0)
+
+
+def mixed_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
+    """Which regions have collisions along a part of their rim only."""
+    region = sheets.region[sheets.pairs[:, 0]]
+    rim = np.bincount(region, minlength=sheets.num_regions)
+    collides = np.bincount(region, colliding_pairs(exclusions, sheets), sheets.num_regions)
+    return (collides > 0) & (collides < rim)
 
 
 def counted_intervals(
@@ -143,7 +157,10 @@ def _group_distance(exclusions: Exclusions, f, g) -> Float[np.ndarray, "N"]:
 
 
 def _group_table(exclusions: Exclusions):
-    names, groups = np.unique(np.frombuffer(exclusions.groups, np.int64), return_inverse=True)
+    """Each face's group as a row of a table of the ignored pairs, and that table."""
+    names, groups = np.unique(
+        np.frombuffer(exclusions.groups or b"", np.int64), return_inverse=True
+    )
     ignored = np.zeros((len(names), len(names)), bool)
     for pair in exclusions.ignored:
         at = np.searchsorted(names, pair)

@@ -75,7 +75,7 @@ def find_overlaps(
     level = winding_numbers(crossings) + (crossings.sign < 0)
     found = np.flatnonzero(level != 1)
     if len(found):
-        hit_edge_on = _edge_on(points, faces)[crossings.face]
+        hit_edge_on = _edge_on(points, faces, crossings.face)
         if hit_edge_on.any():
             found = found[~np.isin(crossings.ray[found], crossings.ray[hit_edge_on])]
     levels, ray = level[found], crossings.ray[found]
@@ -118,12 +118,20 @@ def _around(level, face, opens, levels) -> Int[np.ndarray, "N 2"]:
     return around
 
 
-def _edge_on(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:
-    x0, x1, x2 = points.column[faces.T]
-    y0, y1, y2 = points.row[faces.T]
+def _edge_on(
+    points: ScreenPoints, faces: Int[np.ndarray, "F 3"], hit: Int[np.ndarray, "N"]
+) -> Bool[np.ndarray, "N"]:
+    """Which crossings are with triangles that are lines on the screen."""
+    met = np.zeros(len(faces), bool)
+    met[hit] = True
+    met = np.flatnonzero(met)
+    x0, x1, x2 = points.column[faces[met].T]
+    y0, y1, y2 = points.row[faces[met].T]
     twice_area = np.abs((x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0))
     size = np.abs(x1 - x0) + np.abs(y1 - y0) + np.abs(x2 - x0) + np.abs(y2 - y0)
-    return twice_area <= _NARROWEST * size
+    narrow = np.zeros(len(faces), bool)
+    narrow[met[twice_area <= _NARROWEST * size]] = True
+    return narrow[hit]
 
 
 def _barycentric(

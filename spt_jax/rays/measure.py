@@ -1,20 +1,31 @@
 """One mesh through all of its beams: volume, gradient and labels, for `host.py` and `report.py`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.beam import Beam, Rays, aim
+from spt_jax.rays import closed_form
+from spt_jax.rays.beam import Beam, Rays, ScreenPoints, aim
 from spt_jax.rays.boundary import boundary_gradient, vertex_gradient
+from spt_jax.rays.closed_form import ClosedForm
 from spt_jax.rays.crossings import cast
 from spt_jax.rays.density import aim_at_sheets
-from spt_jax.rays.exclusions import NOTHING, Exclusions, counted_intervals, counted_labels
-from spt_jax.rays.labels import triangle_labels
+from spt_jax.rays.exclusions import (
+    NOTHING,
+    Exclusions,
+    colliding_pairs,
+    counted_intervals,
+    counted_labels,
+    counted_regions,
+    mixed_regions,
+)
+from spt_jax.rays.labels import triangle_labels, triangle_labels_without_rays
 from spt_jax.rays.levels import Overlaps, find_overlaps
 from spt_jax.rays.sheets import Map, Sheets, find_sheets
+from spt_jax.rays.vertex_winding import vertex_winding
 
 Directions = tuple[tuple[float, float, float], ...]
 Value = Literal["volume", "ratio"]
@@ -75,62 +86,124 @@ class Measurement:
         return find_sheets(self.vertices, self.faces, directions, self.map_tasks)
 
     @cached_property
+    def closed_form(self) -> ClosedForm | None:
+        """What is known of the overlaps without rays; None where rays were asked for."""
+        if self.sampling.rays != "auto":
+            return None
+        return closed_form.solve(self.vertices, self.faces, self.sheets)
+
+    @cached_property
+    def _counted(self) -> Bool[np.ndarray, "R"]:
+        if self.exclusions.any:
+            return counted_regions(self.exclusions, self.sheets)
+        return np.ones(self.sheets.num_regions, bool)
+
+    @cached_property
+    def _exactly(self) -> Bool[np.ndarray, "R"]:
+        if self.closed_form is None:
+            return np.zeros(self.sheets.num_regions, bool)
+        if not self.exclusions.any:
+            return self.closed_form.solved
+        # A region that counts in part needs rays: they tell which part.
+        return self.closed_form.solved & ~mixed_regions(self.exclusions, self.sheets)
+
+    @cached_property
     def beams(self) -> list[Probe]:
-        """Every beam of the sampling, cast through the mesh."""
-        if self.sampling.rays == "auto":
-            _ = self.sheets  # once, before the beams go to several threads
+        """Every beam of the sampling, cast through the mesh; none where none is needed."""
+        if self.sampling.rays == "auto" and self._exactly.all():
+            return []
         found = list(self.map_tasks(self._along, self.sampling.directions))
         if self.exclusions.any:
             counted = counted_intervals(
                 self.exclusions, self.sheets, [probe.everything for probe in found]
             )
             found = [
-                Probe(p.beam, p.everything.only(kept), p.everything, p.crossings, p.open_rays)
-                for p, kept in zip(found, counted, strict=True)
+                replace(probe, overlaps=probe.everything.only(kept))
+                for probe, kept in zip(found, counted, strict=True)
             ]
         return found
 
     def _along(self, direction: tuple[float, float, float]) -> Probe:
         rays, towards = self.sampling.rays, np.array(direction)
-        if isinstance(rays, str):
-            beam, points = aim_at_sheets(self.vertices, self.faces, towards, self.sheets)
-        else:
-            beam, points = aim(self.vertices, towards, rays)
+        if rays != "auto":
+            return self._cast(*aim(self.vertices, towards, rays))
+        sheets, by_rays = self.sheets, ~self._exactly
+        bounding = sheets.faces[by_rays[sheets.region[sheets.faces]]]
+        probe = self._cast(*aim_at_sheets(self.vertices, self.faces, towards, sheets, bounding))
+        # Other regions lie behind the same tiles; what is in none was not told from the triangles.
+        region = sheets.region[probe.everything.ends].max(axis=1, initial=-1)
+        kept = probe.everything.only(np.append(by_rays, True)[region])
+        return replace(probe, overlaps=kept, everything=kept)
+
+    def _cast(self, beam: Beam, points: ScreenPoints) -> Probe:
         crossings = cast(beam, points, self.faces, simple_rays=False)
         overlaps = find_overlaps(beam, points, self.faces, crossings)
         return Probe(beam, overlaps, overlaps, crossings.met, crossings.open_rays)
 
     @property
+    def volumes(self) -> list[float]:
+        """The overlap volume that counts, as each beam sees it."""
+        exact = 0.0
+        if self.closed_form is not None:
+            exact = float(self.closed_form.volume[self._exactly & self._counted].sum())
+        beams = self.beams
+        if not beams:
+            return [exact] * len(self.sampling.directions)
+        return [exact + found.volume for found in beams]
+
+    @property
     def volume(self) -> float:
         """The overlap volume that counts: the mean of the beams' own."""
-        return float(np.mean([found.volume for found in self.beams]))
+        return float(np.mean(self.volumes))
 
     @property
     def total_volume(self) -> float:
         """The overlap volume with what is left out."""
-        return float(np.mean([found.total_volume for found in self.beams]))
+        exact = 0.0
+        if self.closed_form is not None:
+            exact = float(self.closed_form.volume[self._exactly].sum())
+        return exact + float(np.mean([found.total_volume for found in self.beams] or [0.0]))
+
+    @property
+    def crossing_pairs(self) -> int:
+        """Pairs of triangles that pass through each other and count."""
+        return int(np.count_nonzero(colliding_pairs(self.exclusions, self.sheets)))
 
     def labels(self, rule: Rule) -> Int[np.ndarray, "V"]:
         """V_0, V_out and V_in of the overlaps that count.
 
         By each vertex itself, or by Algorithm 1's triangle rule over all beams.
         """
+        if rule == "vertex" and not self.exclusions.any and "sheets" not in vars(self):
+            directions = np.array(self.sampling.directions)
+            winding = vertex_winding(self.vertices, self.faces, directions)
+            return np.sign(winding).astype(np.int8)
         if rule == "vertex":
             return counted_labels(self.exclusions, self.sheets, self.faces)
+        if self.closed_form is not None:
+            return triangle_labels_without_rays(
+                self.faces, self.sheets, self.closed_form, self._counted
+            )
         overlaps = [found.overlaps for found in self.beams]
         return triangle_labels(self.faces, overlaps, len(self.vertices))
 
     def gradient(self, kind: Gradient, rule: Rule) -> Float[np.ndarray, "V 3"]:
         """The boundary integral, or the paper's Eq. 9 ("vertex") or Eq. 10 ("unit")."""
-        if kind == "boundary":
-            directions = np.stack([found.beam.direction for found in self.beams])
-            shares = [
-                boundary_gradient(self.vertices, self.faces, p.beam, p.overlaps, directions)
-                for p in self.beams
-            ]
-            return np.sum(shares, axis=0)
-        label = self.labels(rule)
-        return vertex_gradient(self.vertices, self.faces, label, unit=kind == "unit")
+        if kind != "boundary":
+            label = self.labels(rule)
+            return vertex_gradient(self.vertices, self.faces, label, unit=kind == "unit")
+        total = np.zeros(self.vertices.shape)
+        if self.closed_form is not None:
+            exactly = self._exactly & self._counted
+            total += closed_form.gradient(
+                self.vertices, self.faces, self.sheets, self.closed_form, exactly
+            )
+        directions = np.array([found.beam.direction for found in self.beams])
+        for found in self.beams:
+            total += boundary_gradient(
+                self.vertices, self.faces, found.beam, found.overlaps, directions
+            )
+        return total
 
 
 def measure(
@@ -150,25 +223,3 @@ def usable(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) ->
         np.isfinite(vertices).all()
         and (faces.size == 0 or (faces.min() >= 0 and faces.max() < len(vertices)))
     )
-
-
-def probe(vertices, faces, sampling, map_directions=map):  # shims while others move over
-    return measure(vertices, faces, sampling, map_tasks=map_directions).beams
-
-
-def volume(beams):
-    return float(np.mean([b.volume for b in beams]))
-
-
-def labels(faces, num_vertices, beams):
-    return triangle_labels(faces, [b.overlaps for b in beams], num_vertices)
-
-
-def gradient(vertices, faces, beams, kind):
-    if kind != "boundary":
-        return vertex_gradient(
-            vertices, faces, labels(faces, len(vertices), beams), unit=kind == "unit"
-        )
-    directions = np.stack([found.beam.direction for found in beams])
-    shares = [boundary_gradient(vertices, faces, p.beam, p.overlaps, directions) for p in beams]
-    return np.sum(shares, axis=0)

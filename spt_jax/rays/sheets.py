@@ -65,12 +65,15 @@ def find_sheets(
 
 def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
     # Triangles of one region share a vertex that lies in an overlap, or pass through each other.
-    # Sharing a vertex outside is not enough: two overlaps may meet at one triangle's corner.
+    # Sharing a vertex outside is not enough: two overlaps may meet at one triangle's corner. But at
+    # a vertex whose own triangles pass through each other, inside and outside cannot be told.
     region = np.full(len(faces), -1)
     if not len(found):
         return 0, region
     corners = faces[found]
-    row, corner = np.nonzero((winding != 0)[corners])
+    binding = winding != 0
+    binding[shared_corners(faces, pairs)] = True
+    row, corner = np.nonzero(binding[corners])
     node = np.full(len(faces), -1)
     node[found] = np.arange(len(found))
     first = np.concatenate([row, node[pairs[:, 0]]])
@@ -80,3 +83,11 @@ def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
     component = connected_components(links, directed=False)[1][: len(found)]
     used, region[found] = np.unique(component, return_inverse=True)
     return len(used), region
+
+
+def shared_corners(
+    faces: Int[np.ndarray, "F 3"], pairs: Int[np.ndarray, "P 2"]
+) -> Int[np.ndarray, "C"]:
+    """The vertices that two triangles share which pass through each other."""
+    first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
+    return np.unique(first[(first[:, :, None] == second[:, None, :]).any(axis=2)])
