@@ -127,8 +127,8 @@ class RestSurface:
 
         Paths over each one's nearest seed bound the distance from both sides; this is the middle.
         On the embedded body it is 8 mm off on average and 50 mm at most (1.5 million pairs), and
-        50,000 pairs take 1.0 ms. Triangles that touch may get more than 0: to tell them for
-        certain is what `near` with `exact` is for.
+        50,000 pairs take 1.0 ms; on icospheres of 162 and 642 vertices it is a quarter of an edge
+        off on average and 1.2 edges at most. Triangles that share a vertex may get more than 0.
         """
         lower, upper = self._bounds(f, g)
         lower += upper
