@@ -1,6 +1,7 @@
 """Freeing a posed body of its self-intersections by moving its joints."""
 
 from collections.abc import Callable
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -10,10 +11,19 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from spt_jax.arguments import MOST_RAYS, as_directions, as_rays
+from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
-from spt_jax.classes import classify_vertices
+from spt_jax.fit.spread import Surface
+from spt_jax.fit.untangle_mesh import untangle_checked
+from spt_jax.geometry import inflate
+from spt_jax.host import parallel_map
 from spt_jax.penalty import self_intersection_penalty
+from spt_jax.rays.beam import Rays
+from spt_jax.rays.exclusions import Exclusions
+from spt_jax.rays.measure import Sampling, measure
+from spt_jax.rest_surface import RestSurface
+
+Folds = Literal["ignore", "remove", "count"]
 
 # Per cubic centimetre, against squared centimetres of displacement. The first is weak enough that
 # the pose slides along the contact rather than jumping out of it; the last leaves about a
@@ -27,26 +37,37 @@ _STIFFNESS = 1e-3
 
 _CENTIMETRE = 0.01
 
+# What is tried where the weights did not free a pose: the margin, times this, with the last weights
+# again from where the last attempt ended.
+_WIDER = (2.0, 4.0)
+_AGAIN = 2
+
 
 class Overlap(eqx.Module):
     """How much of a body is in self-intersection.
 
     Attributes:
-        volume: the overlap volume, in m^3.
-        ratio: the part of the vertices in it (paper, Eq. 11).
+        volume: the overlap volume that counts, in m^3: without folds, unless they count.
+        total_volume: the same with folds.
+        ratio: the part of the vertices in overlaps that count (paper, Eq. 11).
+        crossings: pairs of triangles that pass through each other and count.
+        total_crossings: the same with folds.
     """
 
     volume: Float[Array, "*batch"]
+    total_volume: Float[Array, "*batch"]
     ratio: Float[Array, "*batch"]
+    crossings: Int[Array, "*batch"]
+    total_crossings: Int[Array, "*batch"]
 
 
 class UntangleResult(eqx.Module):
     """What `untangle_pose` found.
 
     Attributes:
-        pose: the pose with the least overlap of all that were measured.
-        vertices: the body in that pose, in metres.
-        before, after: the overlap of the pose given and of the pose found.
+        pose: the best pose of all that were measured.
+        vertices: the body in that pose, in metres; with folds="remove" its vertices were moved on.
+        before, after: the overlap of the pose given and of what was found.
         steps: of the solver, over all weights.
     """
 
@@ -63,7 +84,9 @@ def untangle_pose(
     *,
     shape: Float[Array, "*#batch B"] | Float[np.ndarray, "*#batch B"] | None = None,
     translation: Float[Array, "*#batch 3"] | Float[np.ndarray, "*#batch 3"] | None = None,
-    rays: int = 256,
+    folds: Folds = "ignore",
+    margin: float = 0.002,
+    rays: int | str = "auto",
     directions: int | Float[np.ndarray, "D 3"] = 3,
     weights: tuple[float, ...] = _WEIGHTS,
     steps_per_weight: int = 25,
@@ -71,53 +94,63 @@ def untangle_pose(
     solver: optx.AbstractMinimiser | None = None,
     on_step: Callable[[int, int, float], None] | None = None,
 ) -> UntangleResult:
-    """The pose nearest to the one given that is free of self-intersection, as far as it goes.
+    """The pose nearest to the one given in which no body parts collide, as far as it goes.
 
     For each weight in turn an optimistix minimiser takes
 
         (rms vertex displacement / cm)^2 + weight * (overlap volume / cm^3)
 
-    from where the last one stopped; the displacement is that of the body's linearisation at the
-    pose given, which makes its term a plain sum of squares in the solver's variables. All joints
-    move but the root: turning the whole body frees nothing. The overlap is the sum of collisions
-    and of the folds that skinning makes at armpits and groins; a deep fold may be traded for a
-    visible change of the pose.
+    from where the last one stopped, until no two parts of the surface cross; the displacement is
+    that of the body's linearisation at the pose given, which makes its term a plain sum of squares
+    in the solver's variables. All joints move but the root: turning the whole body frees nothing.
+    The overlap is that of the surface moved outwards by half of `margin`. Where the weights do not
+    free the pose, the last ones are tried again with two and four times the margin.
 
     Args:
         body: any `BodyModel`.
         pose: axis-angle, radians; leading axes are solved one after another.
         shape: shape coefficients, held fixed.
         translation: in metres, held fixed.
-        rays: rays along the longer side of the screen during the search; what is compared and
-            reported is measured with twice as many.
+        folds: what happens to overlaps of sheets that lie near each other on the rest surface,
+            the creases that skinning makes at armpits, elbows and groins. "ignore": they are left
+            as they are, and a pose that has only those comes back unchanged. "remove": the pose
+            is freed of collisions, then `untangle_mesh` moves the vertices until the surface
+            crosses itself nowhere. "count": they are no different from collisions; the pose has
+            to open them, at the price of a visible change, and no margin is kept.
+        margin: how far apart colliding parts are pushed, in metres.
+        rays: as in `self_intersection_penalty`; a number is what the search uses, and what is
+            compared and reported is measured with twice as many.
         directions: as in `self_intersection_penalty`.
         weights: rising weights of the overlap.
         steps_per_weight: most steps of the solver for each weight.
-        tolerance: an overlap of this volume or less, in m^3, is none; the default is 1 mm^3.
+        tolerance: an overlap of this volume or less, in m^3, is none where nothing crosses; the
+            default is 1 mm^3.
         solver: an optimistix minimiser; BFGS by default.
-        on_step: called with the index of the weight, the steps so far and the overlap volume
-            whenever a weight is done.
+        on_step: called with the index of the weight, the steps so far and the overlap volume that
+            counts whenever a weight is done.
 
     Returns:
-        The pose with the least overlap of those measured after each weight, never worse than the
-        one given; a pose without overlap comes back unchanged.
+        The pose with the fewest crossings, and of those the least overlap, of those measured after
+        each weight, never worse than the one given; a pose in which nothing collides comes back
+        unchanged.
 
     Raises:
         ValueError: pose of another shape than (..., J, 3) or with values that are not finite;
             shape or translation that is not finite or does not fit pose's batch axes; no weights,
             or weights that are not positive and finite; steps_per_weight not positive; more than
-            2048 rays, or fewer than one; directions as in `self_intersection_penalty`.
-        TypeError: pose traced; rays or directions that are no numbers.
+            2048 rays, or fewer than one; an unknown way with folds; margin negative or not finite;
+            directions as in `self_intersection_penalty`.
+        TypeError: pose traced; rays, margin or directions that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
 
     Example:
         >>> from spt_jax import load_body, load_mocap, untangle_pose
         >>> body, mocap = load_body(), load_mocap()
-        >>> pose = body.pose_from_smpl(mocap.pose[mocap.names.index("crawl/0092")])
-        >>> result = untangle_pose(body, pose, rays=64, weights=(0.1, 1.0))
-        >>> bool(result.after.volume < 0.1 * result.before.volume)
-        True
+        >>> pose = body.pose_from_smpl(mocap.pose[mocap.names.index("cartwheel/0103")])
+        >>> result = untangle_pose(body, pose)
+        >>> int(result.before.crossings) > 0, int(result.after.crossings)
+        (True, 0)
     """
     pose = jnp.asarray(pose)
     if pose.shape[-2:] != (body.num_joints, 3):
@@ -142,24 +175,28 @@ def untangle_pose(
         raise ValueError(
             f"steps_per_weight must be a positive whole number: got {steps_per_weight!r}."
         )
-    search_rays = as_rays(rays)
-    if isinstance(search_rays, tuple) or 2 * search_rays > MOST_RAYS:
-        raise ValueError(
-            f"rays must be a whole number up to {MOST_RAYS // 2}, half of what is measured with: "
-            f"got {rays!r}."
-        )
     batch = pose.shape[:-2]
     for name, array in (("shape", shape), ("translation", translation)):
         if array is not None and not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite: got {np.asarray(array)!r}.")
+    way = as_choice("folds", folds, Folds)
     search = _Search(
-        search_rays, as_directions(directions), solver or optx.BFGS(rtol=1e-3, atol=1e-3)
+        rays=_as_search_rays(rays),
+        directions=as_directions(directions),
+        folds=way,
+        margin=0.0 if way == "count" else as_margin(margin),
+        weights=weights,
+        steps_per_weight=int(steps_per_weight),
+        tolerance=float(tolerance),
+        solver=solver or optx.BFGS(rtol=1e-3, atol=1e-3),
+        rest=None if way == "count" else body.rest_surface,
     )
     poses = pose.reshape(-1, *pose.shape[-2:])
     shapes = _per_pose("shape", shape, batch, len(poses))
     translations = _per_pose("translation", translation, batch, len(poses))
+    surface = Surface(np.asarray(body.faces), body.num_vertices) if way == "remove" else None
     found = [
-        _untangle_one(search, body, *one, weights, steps_per_weight, tolerance, on_step or _nothing)
+        _untangle_one(search, surface, body, *one, on_step or _nothing)
         for one in zip(poses, shapes, translations, strict=True)
     ]
     if not found:
@@ -168,56 +205,115 @@ def untangle_pose(
 
 
 class _Search(eqx.Module):
-    rays: int = eqx.field(static=True)
+    """What stays the same for all poses; static, so that the solver is compiled once."""
+
+    rays: Rays = eqx.field(static=True)
     directions: tuple = eqx.field(static=True)
+    folds: Folds = eqx.field(static=True)
+    margin: float = eqx.field(static=True)
+    weights: tuple[float, ...] = eqx.field(static=True)
+    steps_per_weight: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+    rest: RestSurface | None = eqx.field(static=True)
     solver: optx.AbstractMinimiser
+
+    @property
+    def measured_rays(self) -> Rays:
+        """What is compared and reported is measured with."""
+        return 2 * self.rays if isinstance(self.rays, int) else "auto"
+
+    def measure(self, vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Overlap:
+        """The overlap of a posed body."""
+        dtype = vertices.dtype
+        found = measure(
+            np.asarray(vertices, np.float64),
+            np.asarray(faces, np.int64),
+            Sampling(self.measured_rays, self.directions),
+            Exclusions(rest=self.rest),
+            parallel_map,
+        )
+        return Overlap(
+            volume=jnp.asarray(found.volume, dtype),
+            total_volume=jnp.asarray(found.total_volume, dtype),
+            ratio=jnp.asarray(np.mean(found.labels("vertex") != 0), dtype),
+            crossings=jnp.asarray(found.crossing_pairs, jnp.int32),
+            total_crossings=jnp.asarray(len(found.sheets.pairs), jnp.int32),
+        )
+
+    def rank(self, overlap: Overlap) -> tuple[int, float]:
+        """Sorts overlaps, the best first."""
+        volume = float(overlap.volume)
+        if not np.isfinite(volume):
+            return np.iinfo(np.int64).max, np.inf
+        return (0 if self.folds == "count" else int(overlap.crossings)), volume
+
+    def is_free(self, overlap: Overlap) -> bool:
+        """Whether there is nothing left to do."""
+        crossings, volume = self.rank(overlap)
+        return crossings == 0 and volume <= self.tolerance
+
+    def attempts(self) -> list[tuple[float, float]]:
+        """Margin and weight of every descent."""
+        if self.folds == "count":
+            return [(0.0, weight) for weight in self.weights]
+        again = [(self.margin * wider, w) for wider in _WIDER for w in self.weights[-_AGAIN:]]
+        return [(self.margin, weight) for weight in self.weights] + again
+
+
+def _as_search_rays(rays: Any) -> Rays:
+    search_rays = as_rays(rays)
+    if isinstance(search_rays, tuple) or (
+        isinstance(search_rays, int) and 2 * search_rays > MOST_RAYS
+    ):
+        raise ValueError(
+            f'rays must be "auto" or a whole number up to {MOST_RAYS // 2}, half of what is '
+            f"measured with: got {rays!r}."
+        )
+    return search_rays
 
 
 def _untangle_one(
-    search, body, pose, shape, translation, weights, steps_per_weight, tolerance, on_step
+    search: _Search, surface: Surface | None, body, pose, shape, translation, on_step
 ) -> UntangleResult:
-    before = _measure(search, body, pose, shape, translation)
-    best, least, steps = pose, float(before.volume), 0
-    if least > tolerance:
+    vertices = body(pose, shape, translation).vertices
+    before = search.measure(vertices, body.faces)
+    best, after, steps = pose, before, 0
+    if not search.is_free(before):
         factor = _displacement_factor(body, pose, shape)
         moved = jnp.zeros(factor.shape[:1], pose.dtype)
         idle = 0
-        for stage, weight in enumerate(weights):
+        for stage, (margin, weight) in enumerate(search.attempts()):
             moved, taken = _descend(
                 search,
                 body,
                 (pose, shape, translation, factor),
                 moved,
+                jnp.asarray(margin, pose.dtype),
                 jnp.asarray(weight, pose.dtype),
-                steps_per_weight,
             )
             steps += int(taken)
             candidate = _turned(pose, factor, moved)
-            volume = float(_measure(search, body, candidate, shape, translation).volume)
-            idle = idle + 1 if not volume < 0.99 * least else 0
-            if volume < least:
-                best, least = candidate, volume
-            on_step(stage, steps, volume)
+            posed = body(candidate, shape, translation).vertices
+            overlap = search.measure(posed, body.faces)
+            gained = search.rank(overlap) < search.rank(after)
+            falls = float(overlap.volume) < 0.99 * float(after.volume)
+            idle = 0 if falls else idle + 1
+            if gained:
+                best, after, vertices = candidate, overlap, posed
+            on_step(stage, steps, float(overlap.volume))
             # The first weights may be too weak to move anything; two in a row that gain nothing
-            # after that mean that it no longer falls.
-            if least <= tolerance or (idle >= 2 and stage > 2) or not np.isfinite(volume):
+            # after that mean that the volume no longer falls.
+            stuck = search.folds == "count" and idle >= 2 and stage > 2
+            if search.is_free(after) or stuck or not np.isfinite(overlap.volume):
                 break
+    if surface is not None and int(after.total_crossings):
+        sampling = Sampling(search.measured_rays, search.directions)
+        freed = untangle_checked(np.asarray(vertices), surface, sampling).vertices
+        vertices = jnp.asarray(freed)
+        after = search.measure(vertices, body.faces)
     return UntangleResult(
-        pose=best,
-        vertices=body(best, shape, translation).vertices,
-        before=before,
-        after=_measure(search, body, best, shape, translation),
-        steps=jnp.asarray(steps),
+        pose=best, vertices=vertices, before=before, after=after, steps=jnp.asarray(steps)
     )
-
-
-@eqx.filter_jit
-def _measure(search, body, pose, shape, translation) -> Overlap:
-    vertices = body(pose, shape, translation).vertices
-    options = {"rays": 2 * search.rays, "directions": np.array(search.directions)}
-    volume = self_intersection_penalty(vertices, body.faces, **options)
-    ratio = classify_vertices(vertices, body.faces, **options).ratio
-    return Overlap(volume=volume, ratio=ratio.astype(volume.dtype))
 
 
 @eqx.filter_jit
@@ -236,17 +332,28 @@ def _turned(pose, factor, moved):
 
 
 @eqx.filter_jit
-def _descend(search, body, fixed, moved, weight, max_steps):
+def _descend(search: _Search, body, fixed, moved, margin, weight):
     def objective(moved, arguments):
-        body, (pose, shape, translation, factor), weight = arguments
+        body, (pose, shape, translation, factor), margin, weight = arguments
         vertices = body(_turned(pose, factor, moved), shape, translation).vertices
+        if search.margin:
+            vertices = inflate(vertices, body.faces, margin / 2)
         volume = self_intersection_penalty(
-            vertices, body.faces, rays=search.rays, directions=np.array(search.directions)
+            vertices,
+            body.faces,
+            rays=search.rays,
+            directions=np.array(search.directions),
+            folds=search.rest,
         )
         return jnp.sum(moved**2) + weight * volume / _CENTIMETRE**3
 
     solution = optx.minimise(
-        objective, search.solver, moved, (body, fixed, weight), max_steps=max_steps, throw=False
+        objective,
+        search.solver,
+        moved,
+        (body, fixed, margin, weight),
+        max_steps=search.steps_per_weight,
+        throw=False,
     )
     return solution.value, solution.stats["num_steps"]
 
