@@ -4,7 +4,8 @@ Overlaps are decided twice. A region of overlap counts where anywhere along its 
 cross that may collide; that settles the folds of skinning, whose sheets meet at a crease. Within a
 region that counts, an interval on a ray counts where its four sheets may collide: the two solids
 that overlap there either cross or lie one in the other, and every end of one must be apart from
-every end of the other. A region that counts although none of its intervals does, counts whole.
+every end of the other. Intervals that end on a triangle which collides at the rim count too, so
+that a region that counts never weighs nothing.
 """
 
 from typing import Any, NamedTuple, Protocol
@@ -89,16 +90,14 @@ def counted_intervals(
 ) -> list[Bool[np.ndarray, "N"]]:
     """Which intervals of each beam count."""
     allowed = np.append(counted_regions(exclusions, sheets), True)  # -1: in no region
-    regions = [sheets.region[overlaps.ends].max(axis=1, initial=-1) for overlaps in beams]
-    apart = [_apart(exclusions, overlaps) for overlaps in beams]
-    resolved = np.zeros(len(allowed), bool)
-    for region, free in zip(regions, apart, strict=True):
-        resolved[region[free]] = True
-    resolved[-1] = True
-    return [
-        allowed[region] & (free | ~resolved[region])
-        for region, free in zip(regions, apart, strict=True)
-    ]
+    collides = np.zeros(len(sheets.region), bool)
+    collides[sheets.pairs[colliding_pairs(exclusions, sheets)]] = True
+    counted = []
+    for overlaps in beams:
+        region = sheets.region[overlaps.ends].max(axis=1, initial=-1)
+        at_rim = collides[overlaps.ends].any(axis=1)
+        counted.append(allowed[region] & (at_rim | _apart(exclusions, overlaps)))
+    return counted
 
 
 def counted_labels(
