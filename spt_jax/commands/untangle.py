@@ -1,4 +1,4 @@
-"""`spt-jax untangle`: a pose file, freed of self-intersections."""
+"""`spt-jax untangle`: a pose file or a mesh file, freed of self-intersections."""
 
 import json as json_format
 import re
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import tyro
 
+from spt_jax.commands.mesh import untangle_mesh_file
 from spt_jax.commands.terminal import err_console, out_console, progress_bar, show, user_errors
 
 if TYPE_CHECKING:
@@ -27,13 +28,16 @@ def untangle(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Free the poses of an .npz file from self-intersections, frame by frame.
+    """Free the poses of an .npz file from self-intersections, frame by frame, or one mesh file.
 
     Takes AMASS files, parameters of SMPL, SMPL-H and SMPL-X, and files that this command wrote.
     Writes poses.npz (AMASS layout, in the body's joints) and report.json.
 
+    Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
+    in the same format; the exit code is 1 if something still crosses.
+
     Args:
-        poses: the pose file.
+        poses: the pose file, or a mesh file of any other suffix than .npz.
         out: folder for the results, made where missing.
         frames: which frames: numbers from 0, ranges and names, such as 0,5,10-12 or crawl/0012
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
@@ -43,6 +47,10 @@ def untangle(
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
+    if poses.suffix.lower() != ".npz":
+        with user_errors():
+            _refuse_for_mesh(frames=frames != "all", body=body != "anny")
+        return untangle_mesh_file(poses, out, meshes=meshes, rays=rays, json=json, quiet=quiet)
     from spt_jax.arguments import as_rays
     from spt_jax.fit.pose_files import read_poses
     from spt_jax.output_files import ensure_folder, write_json
@@ -87,6 +95,12 @@ def untangle(
     also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
     show(console, f"in {folder}: poses.npz, report.json{also}")
     return 0
+
+
+def _refuse_for_mesh(**used: bool) -> None:
+    for name, given in used.items():
+        if given:
+            raise ValueError(f"{name} is for pose files (.npz): got it with a mesh; leave it out.")
 
 
 def select_frames(names: Sequence[str], wanted: str) -> list[int]:

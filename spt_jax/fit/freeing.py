@@ -137,7 +137,7 @@ class _Search:
     def push(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], float]:
         """The gradient of the overlap volume, and the volume of a cube on one pixel."""
         found = measure(vertices, self.surface.faces, self.sampling, map_tasks=parallel_map)
-        pixel = max(beam.beam.ray_area for beam in found.beams)
+        pixel = max((beam.beam.ray_area for beam in found.beams), default=0.0)
         return found.gradient("boundary", "vertex"), pixel**1.5
 
     def groups(

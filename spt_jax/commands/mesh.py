@@ -1,0 +1,149 @@
+"""`spt-jax untangle MESH`: one mesh file freed by its vertices, and what is written of it."""
+
+import json as json_format
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from spt_jax.commands.terminal import err_console, out_console, progress_bar, show, user_errors
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spt_jax.fit.untangle_mesh import UntangleMeshResult
+
+# Text formats keep every digit; the others hold float32, so the mesh must be free in float32.
+_TEXT = (".obj", ".off")
+_BINARY = (".ply", ".glb", ".stl")
+
+
+def untangle_mesh_file(
+    path: Path, out: Path, *, meshes: bool, rays: int, json: bool, quiet: bool
+) -> int:
+    """Free one mesh; the exit code is 0 if nothing crosses any more, and 1 otherwise."""
+    from spt_jax.arguments import as_rays
+    from spt_jax.mesh_check import check_mesh
+    from spt_jax.mesh_files import read_mesh
+    from spt_jax.output_files import ensure_folder, write_json
+
+    with user_errors():
+        as_rays(rays)
+        vertices, faces = read_mesh(path)
+        check_mesh(vertices, faces).raise_if_unfit()
+        suffix, notes = path.suffix.lower(), []
+        if suffix not in _TEXT + _BINARY:
+            notes.append(f"{suffix} files are read only; the mesh is written as .ply")
+            suffix = ".ply"
+        folder = ensure_folder(out)
+    for note in notes:
+        show(err_console(quiet), f"note: {note}", "yellow")
+    given = vertices if suffix in _TEXT else vertices.astype(np.float32)
+    start = time.perf_counter()
+    with progress_bar(1, quiet) as state:
+        from spt_jax.fit.untangle_mesh import untangle_mesh
+
+        def on_step(attempt: int, steps: int, crossings: int) -> None:
+            state(f"{path.name}: attempt {attempt + 1}, step {steps}, {crossings} crossings")
+
+        # Half the rays, as for poses: the last crossings do not hang on them.
+        result = untangle_mesh(given, faces, rays=max(rays // 2, 1), on_step=on_step)
+        seconds = time.perf_counter() - start
+        state("writing", done=1)
+        report: dict[str, Any] = {
+            "command": "untangle",
+            "settings": {"mesh": str(path), "rays": rays, "directions": 3},
+            **result.as_dict(),
+            "seconds": round(seconds, 3),
+            "notes": notes,
+        }
+        with user_errors():
+            report["mesh"] = f"{path.stem}_untangled{suffix}"
+            _write(folder / report["mesh"], result.vertices, faces)
+            report["meshes"] = (
+                _write_coloured(folder, path.stem, given, result.vertices, faces, rays)
+                if meshes
+                else []
+            )
+            write_json(folder / "report.json", report)
+    if json:
+        print(json_format.dumps(report, indent=2))
+    else:
+        console = out_console(quiet)
+        console.print(_table(result, seconds))
+        also = "".join(f", {name}" for name in report["meshes"])
+        show(console, f"in {folder}: {report['mesh']}, report.json{also}")
+    if not result.free:
+        left = result.after.crossings
+        show(
+            err_console(quiet),
+            f"not free: {left} of {result.before.crossings} crossings are left; part the pieces "
+            "by hand where they are deepest, or refine the mesh there",
+            "red",
+        )
+    return 0 if result.free else 1
+
+
+def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
+    from rich.table import Table
+
+    table = Table(header_style="bold")
+    for heading in ("", "before", "after"):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    before, after = result.before, result.after
+    colour = "green" if result.free else "red"
+    table.add_row("crossings", f"{before.crossings}", f"[{colour}]{after.crossings}[/{colour}]")
+    table.add_row("overlap, units³", f"{before.volume:.4g}", f"{after.volume:.4g}")
+    table.add_row("vertices in overlap", f"{before.ratio:.2%}", f"{after.ratio:.2%}")
+    table.add_row("vertices moved", "", f"{result.moved}")
+    table.add_row("median displacement", "", f"{result.median_displacement:.4g}")
+    table.add_row("largest displacement", "", f"{result.largest_displacement:.4g}")
+    table.add_row("steps, time", "", f"{result.steps}, {seconds:.1f} s")
+    return table
+
+
+def _write(path: Path, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+    """Write a mesh so that it reads back to the bit: no digit of a freed mesh may be lost."""
+    from spt_jax.mesh_files import write_mesh
+    from spt_jax.output_files import atomic_write
+
+    if path.suffix in (".ply", ".glb"):
+        write_mesh(path, vertices, faces)
+        return
+    if path.suffix == ".stl":
+        import trimesh
+        from trimesh.exchange.stl import export_stl
+
+        content = export_stl(trimesh.Trimesh(vertices, faces, process=False))
+    elif path.suffix == ".obj":
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+        content = ("\n".join(lines) + "\n").encode()
+    else:
+        lines = ["OFF", f"{len(vertices)} {len(faces)} 0"]
+        lines += [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+        lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+        content = ("\n".join(lines) + "\n").encode()
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _write_coloured(
+    folder: Path,
+    stem: str,
+    before: Float[np.ndarray, "V 3"],
+    after: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    rays: int,
+) -> list[str]:
+    from spt_jax.mesh_files import write_mesh
+    from spt_jax.report import intersection_report
+
+    names = []
+    for when, vertices in (("before", before), ("after", after)):
+        names.append(f"{stem}_{when}.glb")
+        labels = intersection_report(vertices, faces, rays=rays).labels
+        write_mesh(folder / names[-1], vertices, faces, labels)
+    return names
