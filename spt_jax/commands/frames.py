@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spt_jax.body import BodyModel
+    from spt_jax.fit.untangle import Folds
     from spt_jax.report import IntersectionReport
 
 _CUBIC_CENTIMETRES = 1e6  # in a cubic metre
@@ -52,12 +53,20 @@ class Frame:
 
 
 def untangle_frames(
-    body: "BodyModel", motion: Motion, *, rays: int, directions: int, state: State
+    body: "BodyModel",
+    motion: Motion,
+    *,
+    rays: "int | Literal['auto']",
+    directions: int,
+    folds: "Folds",
+    state: State,
 ) -> list[Frame]:
-    """Report on each frame with so many rays, untangle it, and report again."""
+    """Report on each frame, untangle it, and report again; folds that stay are not reported."""
     from spt_jax.fit.untangle import untangle_pose
     from spt_jax.report import intersection_report
 
+    rest = body.rest_surface if folds == "ignore" else None
+    asked = {"rays": rays, "directions": directions, "folds": rest}
     frames = []
     for k, name in enumerate(motion.names):
         state(name, done=k)
@@ -70,13 +79,15 @@ def untangle_frames(
             state(f"{name}: stage {int(stage)}, step {int(steps)}, {volume:.1f} cm³")
 
         vertices = np.asarray(body(motion.pose[k], shape, translation).vertices)
-        before = intersection_report(vertices, body.faces, rays=rays, directions=directions)
+        before = intersection_report(vertices, body.faces, **asked)
         result = untangle_pose(
             body,
             motion.pose[k],
             shape=shape,
             translation=translation,
-            rays=max(rays // 2, 1),  # it measures with twice as many as it searches with
+            folds=folds,
+            # It measures with twice as many as it searches with.
+            rays=rays if rays == "auto" else max(rays // 2, 1),
             directions=directions,
             on_step=on_step,
         )
@@ -88,7 +99,7 @@ def untangle_frames(
                 vertices_before=vertices,
                 vertices_after=untangled,
                 before=before,
-                after=intersection_report(untangled, body.faces, rays=rays, directions=directions),
+                after=intersection_report(untangled, body.faces, **asked),
                 steps=int(result.steps),
                 seconds=time.perf_counter() - start,
             )
@@ -108,6 +119,8 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
         "ratio\nafter",
         "overlap\nbefore",
         "overlap\nafter",
+        "crossing\nbefore",
+        "crossing\nafter",
         "steps",
         "time",
     )
@@ -121,6 +134,8 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
             f"[{colour}]{frame.after.ratio:.2%}[/{colour}]",
             f"{frame.before.volume * _CUBIC_CENTIMETRES:.2f} cm³",
             f"[{colour}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f} cm³[/{colour}]",
+            str(frame.before.crossing_pairs[0]),
+            f"[{colour}]{frame.after.crossing_pairs[0]}[/{colour}]",
             str(frame.steps),
             f"{frame.seconds:.1f} s",
         )
@@ -135,7 +150,9 @@ def summary(frames: Sequence[Frame]) -> str:
     )
     change = f" ({after / before - 1:+.2%})" if before else ""
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
-    return f"{count}: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after{change}"
+    pairs = sum(frame.after.crossing_pairs[0] for frame in frames)
+    left = f"; {pairs} pairs of triangles still cross" if pairs else "; no triangles cross"
+    return f"{count}: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after{change}{left}"
 
 
 def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -> dict[str, Any]:

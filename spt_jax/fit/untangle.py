@@ -37,6 +37,9 @@ _STIFFNESS = 1e-3
 
 _CENTIMETRE = 0.01
 
+# For what the vertices have to do once the pose is free, as untangle_mesh's own default.
+_MESH_RAYS = 256
+
 # What is tried where the weights did not free a pose: the margin, times this, with the last weights
 # again from where the last attempt ended.
 _WIDER = (2.0, 4.0)
@@ -307,7 +310,7 @@ def _untangle_one(
             if search.is_free(after) or stuck or not np.isfinite(overlap.volume):
                 break
     if surface is not None and int(after.total_crossings):
-        sampling = Sampling(search.measured_rays, search.directions)
+        sampling = Sampling(_MESH_RAYS, search.directions)
         freed = untangle_checked(np.asarray(vertices), surface, sampling).vertices
         vertices = jnp.asarray(freed)
         after = search.measure(vertices, body.faces)
