@@ -3,7 +3,7 @@
 import json as json_format
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,7 +21,7 @@ _BINARY = (".ply", ".glb", ".stl")
 
 
 def untangle_mesh_file(
-    path: Path, out: Path, *, meshes: bool, rays: int, json: bool, quiet: bool
+    path: Path, out: Path, *, meshes: bool, rays: int | Literal["auto"], json: bool, quiet: bool
 ) -> int:
     """Free one mesh; the exit code is 0 if nothing crosses any more, and 1 otherwise."""
     from spt_jax.arguments import as_rays
@@ -49,7 +49,8 @@ def untangle_mesh_file(
             state(f"{path.name}: attempt {attempt + 1}, step {steps}, {crossings} crossings")
 
         # Half the rays, as for poses: the last crossings do not hang on them.
-        result = untangle_mesh(given, faces, rays=max(rays // 2, 1), on_step=on_step)
+        sampling = {} if rays == "auto" else {"rays": max(rays // 2, 1)}
+        result = untangle_mesh(given, faces, on_step=on_step, **sampling)
         seconds = time.perf_counter() - start
         state("writing", done=1)
         report: dict[str, Any] = {
@@ -136,7 +137,7 @@ def _write_coloured(
     before: Float[np.ndarray, "V 3"],
     after: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    rays: int,
+    rays: int | Literal["auto"],
 ) -> list[str]:
     from spt_jax.mesh_files import write_mesh
     from spt_jax.report import intersection_report

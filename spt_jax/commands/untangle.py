@@ -4,7 +4,7 @@ import json as json_format
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import tyro
@@ -23,8 +23,9 @@ def untangle(
     out: Path = Path("untangled"),
     frames: str = "all",
     body: str = "anny",
+    folds: Literal["ignore", "remove", "count"] = "ignore",
     meshes: bool = False,
-    rays: int = 512,
+    rays: int | Literal["auto"] = "auto",
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -42,14 +43,18 @@ def untangle(
         frames: which frames: numbers from 0, ranges and names, such as 0,5,10-12 or crawl/0012
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
             (.npz, .pkl).
+        folds: of a posed body, what becomes of skin that folds where a joint bends: "ignore" leaves
+            it, "remove" frees the posed vertices of all that still crosses (only the meshes show
+            it, the poses do not), "count" takes folds for collisions.
         meshes: write a .glb of each frame before and after, coloured by class.
-        rays: rays along the longer side of each of the three beams; the search uses half as many.
+        rays: "auto", or rays along the longer side of each of the three beams; the search uses
+            half as many.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
     if poses.suffix.lower() != ".npz":
         with user_errors():
-            _refuse_for_mesh(frames=frames != "all", body=body != "anny")
+            _refuse_for_mesh(frames=frames != "all", body=body != "anny", folds=folds != "ignore")
         return untangle_mesh_file(poses, out, meshes=meshes, rays=rays, json=json, quiet=quiet)
     from spt_jax.arguments import as_rays
     from spt_jax.fit.pose_files import read_poses
@@ -77,9 +82,15 @@ def untangle(
         motion, notes = _motion(given, rows, model, body)
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
-        done = untangle_frames(model, motion, rays=rays, directions=3, state=state)
+        done = untangle_frames(model, motion, rays=rays, directions=3, folds=folds, state=state)
         state("writing", done=len(rows))
-        settings = {"poses": str(poses), "body": body, "rays": rays, "directions": 3}
+        settings = {
+            "poses": str(poses),
+            "body": body,
+            "rays": rays,
+            "directions": 3,
+            "folds": folds,
+        }
         report = as_report("untangle", done, settings)
         with user_errors():
             report["meshes"] = write_meshes(folder, done, model.faces, (".glb",)) if meshes else []

@@ -103,7 +103,7 @@ def untangle_mesh(
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
             must be closed and consistently wound; it need not be connected.
-        rays: rays along the longer side of the screen.
+        rays: as in `self_intersection_penalty`, for the search; more do not free more.
         directions: as in `self_intersection_penalty`.
         attempts: at most so many, each from the vertices given.
         steps_per_attempt: at most so many steps in each attempt.
