@@ -5,8 +5,8 @@ the rays can see is pushed along the gradient of its volume, a Newton step towar
 that they cannot see any more is a curve where two sheets just cross, and is moved so that the
 curve gets shorter. Both are spread smoothly over the surface around (`spread.py`).
 
-On 200 posed bodies this frees 197 at the first attempt and the rest at the second or third; the
-volume alone leaves 4 to 80 crossings on nearly every one.
+Of 200 posed bodies this frees 181 at the first attempt and the rest in later ones; the volume
+alone leaves 4 to 80 crossings on nearly every one.
 """
 
 from collections.abc import Callable
@@ -22,9 +22,9 @@ from spt_jax.rays.measure import Sampling, measure
 from spt_jax.rays.pairs import EdgeCrossings, edge_crossings
 
 # How far a push spreads, in edges, by the root of the number of vertices in the overlap: wide
-# enough that the middle of a deep overlap and its rim move together. Of 0.17, 0.25, 0.35 and 0.5,
-# the small ones move the worst frames least (56, 60 and 212 mm for a body that lies on its arms)
-# and more often need a second attempt, in which it is doubled.
+# enough that the middle of a deep overlap and its rim move together. Of 0.17, 0.25 and 0.5, the
+# small ones move the worst frames least (56, 60 and 212 mm for a body that lies on its arms) and
+# more often need a second attempt, in which it is doubled.
 _REACH = 0.2
 _SHORTEST_REACH, _LONGEST_REACH = 4.0, 96.0
 
