@@ -4,9 +4,41 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import box
 from helpers_penalty import FACES, PAIR, as_jax, loss
 
-from spt_jax import self_intersection_penalty
+from spt_jax import RestSurface, classify_vertices, intersection_report, self_intersection_penalty
+
+OPTIONS = {
+    "default": {},
+    "margin": {"margin": 0.1},
+    "groups": {"face_groups": np.repeat([0, 1], len(FACES) // 2), "ignore_groups": ((0, 0),)},
+    "folds": {"folds": RestSurface(*PAIR)},
+    "ratio": {"value": "ratio", "rule": "triangle", "gradient": "unit"},
+    "rays": {"rays": (20, 30), "directions": 1},
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_nan_and_nothing_with_every_option(name):
+    """One vertex that is not finite: NaN without a gradient. No triangles, or no vertices: zero."""
+    options = OPTIONS[name]
+
+    def penalty(vertices, faces=FACES):
+        return self_intersection_penalty(vertices, faces, **options)
+
+    value, gradient = jax.value_and_grad(penalty)(as_jax(PAIR, "float32").at[5, 1].set(np.nan))
+    assert np.isnan(value)
+    np.testing.assert_array_equal(gradient, 0.0)
+    apart = as_jax(PAIR, "float32").at[len(PAIR[0]) // 2 :, 0].add(3.0)
+    value, gradient = jax.value_and_grad(penalty)(apart)
+    assert value == 0 and np.abs(gradient).max() == 0
+    none = np.zeros((0, 3), np.int32)
+    for name in ("face_groups", "ignore_groups", "folds"):
+        options = {key: value for key, value in options.items() if key != name}
+    for count in (0, 4):
+        value, gradient = jax.value_and_grad(penalty)(jnp.ones((count, 3)), none)
+        assert value == 0 and gradient.shape == (count, 3) and not gradient.any()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -33,6 +65,10 @@ def _wrong(**options):
     return lambda: self_intersection_penalty(jnp.asarray(PAIR[0], "float32"), FACES, **options)
 
 
+def _ignoring(pairs):
+    return _wrong(face_groups=np.repeat([0, 1], len(FACES) // 2), ignore_groups=pairs)
+
+
 def _wrong_mesh(vertices, faces=FACES):
     return lambda: self_intersection_penalty(vertices, faces)
 
@@ -56,7 +92,7 @@ ERRORS = {
     "far too many rays": (_wrong(rays=5000), ValueError, "from 1 to 4096 a side: got 5000"),
     "negative rays": (_wrong(rays=(3, -4)), ValueError, r"got \(3, -4\)"),
     "fractional rays": (_wrong(rays=3.5), TypeError, "whole number"),
-    "auto rays": (_wrong(rays="auto"), ValueError, "not in this version"),
+    "misspelt rays": (_wrong(rays="automatic"), TypeError, 'rays must be "auto", a whole'),
     "value": (_wrong(value="area"), ValueError, "value must be one of 'volume', 'ratio'"),
     "gradient": (_wrong(gradient="exact"), ValueError, "gradient must be one of 'boundary'"),
     "two directions": (_wrong(directions=2), ValueError, "directions must be 1, 3 or an array"),
@@ -74,9 +110,20 @@ ERRORS = {
     "margin a string": (_wrong(margin="0.01"), TypeError, "number known when traced: got '0.01'"),
     "margin a bool": (_wrong(margin=True), TypeError, "number known when traced"),
     "margin an array": (_wrong(margin=jnp.ones(())), TypeError, "number known when traced"),
-    "groups": (_wrong(face_groups=np.zeros(3)), ValueError, "face_groups is not in"),
-    "ignored": (_wrong(ignore_groups=((0, 1),)), ValueError, "ignore_groups is not in"),
-    "folds": (_wrong(folds=object()), ValueError, "folds is not in this version"),
+    "groups that are no numbers": (_wrong(face_groups=np.zeros(3)), TypeError, "got float64"),
+    "a group a vertex": (
+        _wrong(face_groups=np.zeros(len(GOOD), int)), ValueError, "one number a face, .640,"
+    ),
+    "ignored alone": (_wrong(ignore_groups=((0, 1),)), ValueError, "must come with face_groups"),
+    "no pairs": (_ignoring((0, 1)), ValueError, r"must be pairs of group numbers.*got \(0, 1\)"),
+    "no whole pairs": (_ignoring(((0, 0.5),)), ValueError, "must be pairs of group numbers"),
+    "uneven pairs": (_ignoring(((0, 1), (1,))), ValueError, "must be pairs of group numbers"),
+    "pairs a number": (_ignoring(3), ValueError, "must be pairs of group numbers.*got 3"),
+    "no such group": (_ignoring(((0, 7),)), ValueError, r"got \(0, 7\), and no face is in group 7"),
+    "folds": (_wrong(folds=object()), TypeError, "folds must be a RestSurface or None: got object"),
+    "folds of another mesh": (
+        _wrong(folds=RestSurface(*box())), ValueError, "got one of 12 faces for 640.*copies"
+    ),
 }  # fmt: skip
 
 
@@ -87,6 +134,23 @@ def test_wrong_input_fails_when_traced(name, untyped):
         call()
     with pytest.raises(kind, match=message):
         jax.eval_shape(call)
+
+
+@pytest.mark.parametrize("function", [classify_vertices, intersection_report])
+def test_labels_and_report_refuse_the_same(function, untyped):
+    groups = np.repeat([0, 1], len(FACES) // 2)
+    with pytest.raises(ValueError, match="must come with face_groups"):
+        function(GOOD, FACES, ignore_groups=((0, 1),))
+    with pytest.raises(ValueError, match="no face is in group 2"):
+        function(GOOD, FACES, face_groups=groups, ignore_groups=((0, 2),))
+    with pytest.raises(TypeError, match="folds must be a RestSurface"):
+        function(GOOD, FACES, folds=True)
+
+
+def test_traced_groups_are_refused(untyped):
+    call = jax.jit(lambda g: self_intersection_penalty(GOOD, FACES, face_groups=g))
+    with pytest.raises(TypeError, match="face_groups must be known when traced"):
+        call(jnp.zeros(len(FACES), "int32"))
 
 
 def test_traced_directions_are_refused(untyped):

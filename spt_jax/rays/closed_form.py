@@ -66,7 +66,8 @@ def solve(
     # On the left of the segment, seen against the own normal, is the foreign solid's inside?
     left = np.cross(normals[row[own]], end - start)
     jump = -np.sign(np.einsum("ki,ki->k", left, normals[row[foreign]]))
-    sums, sound = _sides(vertices, faces, sheets, row, segments.cusps(faces, row, own, jump))
+    cusps = segments.cusps(faces, row, own, jump)
+    sums, sound, deep = _sides(vertices, faces, sheets, row, cusps)
     on_own = (_coordinates(vertices, corners[row[own]], normals[row[own]], x) for x in (start, end))
     np.add.at(sums, row[own], jump[:, None] * _along(*on_own))
     sound &= (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
@@ -74,8 +75,9 @@ def solve(
 
     share = sums[:, :3]
     region = sheets.region[found]
-    solved = np.bincount(region, ~sound, sheets.num_regions) == 0
-    return _volumes(vertices[corners], normals, share, region, solved)
+    fits = np.bincount(region, ~sound, sheets.num_regions) == 0
+    shallow = np.bincount(region, deep, sheets.num_regions) == 0
+    return _volumes(vertices[corners], normals, share, region, fits, shallow)
 
 
 def gradient(
@@ -96,8 +98,8 @@ def gradient(
     return total
 
 
-def _volumes(points, normals, share, region, solved) -> ClosedForm:
-    count = len(solved)
+def _volumes(points, normals, share, region, fits, shallow) -> ClosedForm:
+    count = len(fits)
     center = np.zeros((count, 3))
     faces_in = np.maximum(np.bincount(region, minlength=count), 1)
     for axis in range(3):
@@ -110,8 +112,32 @@ def _volumes(points, normals, share, region, solved) -> ClosedForm:
     for axis in range(3):
         total = np.bincount(region, pull[:, :, axis].sum(axis=1), count)
         closed &= np.abs(total) <= _CLOSED * size
-    solved = solved & closed
+    fits = fits & closed
+    solved = _without_entangled(points, region, fits & shallow, (volume < 0) | ~fits, volume < 0)
     return ClosedForm(solved, np.where(solved, volume, 0.0), share)
+
+
+def _without_entangled(points, region, solved, may_be_hollow, hollow) -> Bool[np.ndarray, "R"]:
+    """The solved regions that share no overlap with one that is not.
+
+    A cavity in an overlap is a region of its own, with a negative volume. Rays see the two at once:
+    an interval ends at the one and at the other, so both or neither must be left to them.
+    """
+    if solved.all() or not solved.any():
+        return solved
+    low = np.full((len(solved), 3), np.inf)
+    np.minimum.at(low, region, points.min(axis=1))
+    high = np.full((len(solved), 3), -np.inf)
+    np.maximum.at(high, region, points.max(axis=1))
+    solved = solved.copy()
+    left = np.flatnonzero(~solved)
+    while len(left):
+        around = (low <= low[left, None]).all(axis=2) & (high >= high[left, None]).all(axis=2)
+        within = (low >= low[left, None]).all(axis=2) & (high <= high[left, None]).all(axis=2)
+        entangled = (around & may_be_hollow[left, None]) | (within & hollow)
+        left = np.flatnonzero(solved & entangled.any(axis=0))
+        solved[left] = False
+    return solved
 
 
 def _coordinates(vertices, corners, normals, point) -> Float[np.ndarray, "K 2"]:
@@ -133,7 +159,7 @@ def _along(start, end) -> Float[np.ndarray, "K 5"]:
 
 
 def _sides(vertices, faces, sheets: Sheets, row, cusps: "_Cusps"):
-    """The sides' part of all sums, and which triangles are known to be no deeper than w = 1."""
+    """The sides' part of all sums; where they are known; which triangles lie deeper than w = 1."""
     corners = faces[sheets.faces]
     count = len(corners)
     start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
@@ -172,8 +198,8 @@ def _sides(vertices, faces, sheets: Sheets, row, cusps: "_Cusps"):
     before = np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))
     after = begins[side[order]] + run - (run[before] - jump[order][before])
     deep = np.bincount(side[order][np.abs(after) > 1] // 3, minlength=count) > 0
-    sound = (known & (np.abs(begins) <= 1)).reshape(count, 3).all(axis=1) & ~deep
-    return sums, sound
+    deep |= (np.abs(begins) > 1).reshape(count, 3).any(axis=1)
+    return sums, known.reshape(count, 3).all(axis=1), deep
 
 
 def _at_starts(start, end, total_jump, sheets: Sheets, cusps: "_Cusps"):
