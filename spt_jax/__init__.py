@@ -8,6 +8,8 @@ from spt_jax.classes import VertexClasses as VertexClasses
 from spt_jax.classes import classify_vertices as classify_vertices
 from spt_jax.fit.untangle import UntangleResult as UntangleResult
 from spt_jax.fit.untangle import untangle_pose as untangle_pose
+from spt_jax.fit.untangle_mesh import UntangleMeshResult as UntangleMeshResult
+from spt_jax.fit.untangle_mesh import untangle_mesh as untangle_mesh
 from spt_jax.groups import Scene as Scene
 from spt_jax.groups import between_groups as between_groups
 from spt_jax.groups import join_bodies as join_bodies

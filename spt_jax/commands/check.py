@@ -2,7 +2,7 @@
 
 import json as json_format
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -11,19 +11,20 @@ from spt_jax.commands.terminal import CommandError, out_console, user_errors
 
 def check(
     mesh: tyro.conf.Positional[Path],
-    rays: int = 512,
+    rays: int | Literal["auto"] = "auto",
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Report on the self-intersection of a mesh file of any kind that trimesh reads.
 
-    The exit code is 0 if no ray sees an overlap, 1 if the mesh self-intersects, and 2 if it cannot
+    The exit code is 0 if there is no overlap, 1 if the mesh self-intersects, and 2 if it cannot
     be judged: unreadable, open, inconsistently wound or inside out. What is wrong is said with
     counts.
 
     Args:
         mesh: the file, such as body.ply, body.obj, body.stl or body.glb.
-        rays: rays along the longer side of each of the three beams.
+        rays: "auto": measured exactly, with rays only where that fails; or rays along the longer
+            side of each of three beams.
         json: print the report as JSON.
         quiet: print errors alone.
     """
@@ -44,7 +45,7 @@ def check(
     return code
 
 
-def _judge(path: Path, rays: int, found: dict[str, Any]) -> tuple[int, list[Any]]:
+def _judge(path: Path, rays: int | Literal["auto"], found: dict[str, Any]) -> tuple[int, list[Any]]:
     from dataclasses import asdict
 
     from spt_jax.arguments import as_rays
@@ -64,6 +65,6 @@ def _judge(path: Path, rays: int, found: dict[str, Any]) -> tuple[int, list[Any]
     verdict = (
         "[red]it self-intersects[/red]"
         if report.intersects
-        else "[green]no ray sees a self-intersection[/green]"
+        else "[green]it does not self-intersect[/green]"
     )
     return int(report.intersects), [checked, report, verdict]

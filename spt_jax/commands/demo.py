@@ -40,8 +40,9 @@ _GUTTER = 24  # pixels between the halves of the picture
 def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
     """Untangle real motion-capture poses of the embedded body, and show them before and after.
 
-    The pose is freed of collisions, then the skin of its folds. Writes before_after.png (vertices in self-intersection red), a .glb and a .ply of each frame
-    before and after, the untangled poses.npz and report.json.
+    The pose is freed of collisions, then the skin of its folds. Writes before_after.png (triangles
+    in self-intersection red), a .glb and a .ply of each frame before and after, the untangled
+    poses.npz and report.json.
 
     Args:
         out: folder for the results, made where missing.

@@ -112,15 +112,16 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(header_style="bold")
+    # 80 columns have to do where the output is no terminal.
+    table = Table(header_style="bold", padding=0, collapse_padding=True)
     table.add_column("frame", no_wrap=True)
     headings = (
         "ratio\nbefore",
-        "ratio\nafter",
-        "overlap\nbefore",
-        "overlap\nafter",
-        "crossing\nbefore",
-        "crossing\nafter",
+        "\nafter",
+        "overlap, cm³\nbefore",
+        "\nafter",
+        "crossings\nbefore",
+        "\nafter",
         "steps",
         "time",
     )
@@ -132,8 +133,8 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
             escape(frame.name),
             f"{frame.before.ratio:.2%}",
             f"[{colour}]{frame.after.ratio:.2%}[/{colour}]",
-            f"{frame.before.volume * _CUBIC_CENTIMETRES:.2f} cm³",
-            f"[{colour}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f} cm³[/{colour}]",
+            f"{frame.before.volume * _CUBIC_CENTIMETRES:.2f}",
+            f"[{colour}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
             str(frame.before.crossing_pairs[0]),
             f"[{colour}]{frame.after.crossing_pairs[0]}[/{colour}]",
             str(frame.steps),
