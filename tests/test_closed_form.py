@@ -235,6 +235,16 @@ def test_exact_contact_is_never_wrong(name):
         assert np.isfinite(pull).all() and (expected > 0 or not pull.any())
 
 
+def test_coinciding_solids_are_seen_whole():
+    """A box twice in one place: each sheet is as good a boundary as the other, and whichever is
+    taken has all of its tiles cast. For this rotation 1.2 % were missed once."""
+    rng = np.random.default_rng(4)
+    outer = moved(box((3, 3, 4)), random_rotation(rng))
+    inner = moved(box((0.5, 1, 0.5)), random_rotation(rng))
+    found = measure(*join(outer, inner, outer), sampling("auto"))
+    assert found.volume == pytest.approx(36 + 0.25, rel=1e-4)
+
+
 def test_a_cavity_goes_the_way_of_the_overlap_around_it():
     """Three boxes in one place have no closed form, and the hole in two of them none either."""
     hole = inverted(box((0.2, 0.3, 0.25), (0.1, 0.05, 0.0)))

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from spt_jax.rays.beam import Beam, ScreenPoints, on_lattice, square_pixel, turned_frame
 from spt_jax.rays.crossings import cast
 from spt_jax.rays.levels import find_overlaps
-from spt_jax.rays.sheets import Sheets
+from spt_jax.rays.sheets import Sheets, find_sheets
 from spt_jax.rays.tiles import Tiles, boxes
 
 # Rays along the longer side of the screen at refinement 0; tiles are two of its pixels wide.
@@ -33,6 +33,11 @@ MOST_MARKED = 16_000
 # which triangles cross.
 _LARGE = 256
 
+# Crossings this near to an edge or a vertex, as a part of the triangle, tell exact contact; and how
+# far the vertices are then shaken, as a part of the mesh's size: more than what counts as contact
+# in vertex_winding.py, and far less than a pixel.
+_CONTACT, _SHAKE = 1e-9, 1e-6
+
 
 def aim_at_sheets(
     vertices: Float[np.ndarray, "V 3"],
@@ -44,6 +49,7 @@ def aim_at_sheets(
     """A beam through the tiles that some of the bounding triangles touch, as fine as it may be."""
     frame = turned_frame(direction)
     pixel = square_pixel(vertices, direction, BASE_RAYS)
+    bounding = _with_contact(vertices, faces, direction, sheets, bounding)
 
     def aim(refinement: int) -> tuple[Beam, ScreenPoints]:
         size = int(_TILE * 2.0**refinement)
@@ -56,6 +62,29 @@ def aim_at_sheets(
     refinement = int(np.floor(np.log2(MOST_MARKED / rays) / 2))
     refinement = min(max(refinement, _COARSEST), _FINEST)
     return aim(refinement) if refinement else (beam, points)
+
+
+def _with_contact(vertices, faces, direction, sheets: Sheets, bounding) -> Int[np.ndarray, "C"]:
+    """The bounding triangles, and those that are only because solids coincide.
+
+    A sheet on top of another counts as contact, whichever of the two bounds an overlap. Once the
+    vertices are shaken apart, one of them is inside.
+    """
+    crossings = sheets.crossings
+    corner, point = vertices[faces[crossings.face]], crossings.point
+    opposite = np.cross(
+        np.roll(corner, -1, 1) - point[:, None], np.roll(corner, -2, 1) - point[:, None]
+    )
+    area = np.linalg.norm(opposite, axis=2)
+    ends = np.linalg.norm(vertices[crossings.edge] - point[:, None], axis=2)
+    slight = area.min(axis=1) <= _CONTACT * area.max(axis=1)
+    slight |= ends.min(axis=1) <= _CONTACT * ends.max(axis=1)
+    if not (slight & np.isin(crossings.face, bounding)).any():
+        return bounding
+    shift = np.random.default_rng(0).normal(size=vertices.shape)
+    shaken = vertices + _SHAKE * np.ptp(vertices, axis=0).max() * shift
+    apart = find_sheets(shaken, faces, direction[None]).faces
+    return np.union1d(bounding, apart[sheets.region[apart] < 0])
 
 
 def _mark(vertices, faces, sheets, bounding, beam, points, size) -> Bool[np.ndarray, "R C"]:
