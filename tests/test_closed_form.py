@@ -207,6 +207,7 @@ def _turned(mesh):
     return moved(mesh, random_rotation(np.random.default_rng(6)), (0.1, 0.2, 0.3))
 
 
+BALL = sphere(subdivisions=2)
 CONTACT = {
     "boxes that share a face": (join(box(), box(center=(0, 0, 1))), 0.0),
     "boxes that share a part of a face": (join(box(), box((0.5, 2, 1), (0.2, 0.1, 1))), 0.0),
@@ -215,7 +216,7 @@ CONTACT = {
     "an edge on a face": (
         join(box((4, 4, 1)), moved(box(), trimesh.transformations.rotation_matrix(
             np.pi / 4, (1, 0, 0))[:3, :3], (0, 0, 0.5 + np.sqrt(0.5)))), 0.0),
-    "two spheres in one place": (join(sphere(), sphere()), signed_volume(*sphere())),
+    "two spheres in one place": (join(BALL, BALL), signed_volume(*BALL)),
     "two boxes in one place": (join(box(), box()), 1.0),
     "a slab flush with a box": (join(box((2, 2, 2)), box((1, 2, 2), (-0.5, 0, 0))), 4.0),
     "a box in the corner of a box": (join(box((2, 2, 2)), box((1,) * 3, (0.5,) * 3)), 1.0),
