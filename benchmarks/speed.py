@@ -1,5 +1,6 @@
 """What one call costs: `python -m benchmarks.speed [--record]`. Medians of repeated calls."""
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 import tyro
 
 from benchmarks.common import Table, provenance, record_section
-from spt_jax import load_body, load_mocap, self_intersection_penalty
+from spt_jax import classify_vertices, load_body, load_mocap, self_intersection_penalty
 
 FRAME = "crawl/0092"
 
@@ -42,30 +43,32 @@ def main(settings: Settings) -> None:
     pose = body.pose_from_smpl(jnp.asarray(mocap.pose[mocap.names.index(FRAME)]))
     vertices = body(pose).vertices
     batch = jnp.stack([vertices] * 16)
+    labels = jax.jit(lambda v: classify_vertices(v, body.faces).label)
 
-    def penalty(rays, directions):
+    def penalty(**options):
         return jax.jit(
-            jax.value_and_grad(
-                lambda v: self_intersection_penalty(
-                    v, body.faces, rays=rays, directions=directions
-                ).sum()
-            )
+            jax.value_and_grad(lambda v: self_intersection_penalty(v, body.faces, **options).sum())
         )
 
     through_body = jax.jit(
-        jax.value_and_grad(
-            lambda p: self_intersection_penalty(body(p).vertices, body.faces, rays=512)
-        )
+        jax.value_and_grad(lambda p: self_intersection_penalty(body(p).vertices, body.faces))
     )
     only_body = jax.jit(jax.value_and_grad(lambda p: jnp.sum(body(p).vertices ** 2)))
-    three, coarse, one = penalty(512, 3), penalty(256, 3), penalty(512, 1)
+    default, rest = penalty(), body.rest_surface
+    kinds = {
+        "penalty, default (exact, without rays)": default,
+        "penalty, folds left out": penalty(folds=rest),
+        "penalty, folds left out, margin of 2 mm": penalty(folds=rest, margin=0.002),
+        "penalty, 512 x 512 rays, three directions": penalty(rays=512),
+        "penalty, 512 x 512 rays, one direction": penalty(rays=512, directions=1),
+        "penalty, 256 x 256 rays, three directions": penalty(rays=256),
+    }
     calls = {
         "body and its gradient, without the penalty": lambda: only_body(pose),
-        "penalty, 512 x 512 rays, one direction": lambda: one(vertices),
-        "penalty, 256 x 256 rays, three directions": lambda: coarse(vertices),
-        "penalty, 512 x 512 rays, three directions (default)": lambda: three(vertices),
         "body + penalty, default": lambda: through_body(pose),
-        "penalty, default, batch of 16, per mesh": lambda: three(batch),
+        **{name: functools.partial(call, vertices) for name, call in kinds.items()},
+        "penalty, default, batch of 16, per mesh": lambda: default(batch),
+        "labels, vertex rule": lambda: labels(vertices),
     }
     rows = []
     for name, call in calls.items():

@@ -18,8 +18,8 @@ _COMMANDS = {"demo": demo, "check": check, "untangle": untangle}
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0: done. 1: `check` found a self-intersection, or `untangle` left one in a mesh. 2: the input or the output folder is at fault,
-    said in one line on the standard error stream. 130: interrupted.
+    0: done. 1: `check` found a self-intersection, or `untangle` left one in a mesh. 2: the input or
+    the output folder is at fault, said in one line on the standard error stream. 130: interrupted.
 
     Args:
         args: the words after `spt-jax`; those of the process if None.

@@ -163,10 +163,10 @@ def intersection_report(
         >>> import trimesh
         >>> from spt_jax.report import intersection_report
         >>> box = trimesh.creation.box()
-        >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.0, 0.0]))
-        >>> report = intersection_report(pair.vertices, pair.faces, rays=256)
+        >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.5, 0.5]))
+        >>> report = intersection_report(pair.vertices, pair.faces)
         >>> print(f"{report.volume:.2f} of {report.solid_volume:.2f}, {report.num_out} vertices")
-        0.40 of 2.00, 14 vertices
+        0.10 of 2.00, 2 vertices
     """
     given, triangles = one_mesh(vertices, faces)
     points, triangles = np.asarray(given, np.float64), triangles.astype(np.int64)

@@ -98,6 +98,19 @@ def gradient(
     return total
 
 
+def without_entangled(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    sheets: Sheets,
+    closed: ClosedForm,
+    regions: Bool[np.ndarray, "R"],
+) -> Bool[np.ndarray, "R"]:
+    """Those of some solved regions that share no overlap with one that is left to the rays."""
+    hollow = closed.volume < 0
+    points = vertices[faces[sheets.faces]]
+    return _without_entangled(points, sheets.region[sheets.faces], regions, hollow, hollow)
+
+
 def _volumes(points, normals, share, region, fits, shallow) -> ClosedForm:
     count = len(fits)
     center = np.zeros((count, 3))

@@ -9,6 +9,9 @@ from spt_jax.rays.sheets import Sheets
 
 CLEAR, OUT, INSIDE = 0, 1, -1
 
+# A triangle of which no larger part than this lies in an overlap touches it at most.
+_SLIVER = 1e-9
+
 
 def triangle_labels(
     faces: Int[np.ndarray, "F 3"], overlaps: list[Overlaps], num_vertices: int
@@ -26,20 +29,21 @@ def triangle_labels(
     return label
 
 
-def triangle_labels_without_rays(
+def add_labels_without_rays(
+    label: Int[np.ndarray, "V"],
     faces: Int[np.ndarray, "F 3"],
     sheets: Sheets,
     closed: ClosedForm,
-    counted: Bool[np.ndarray, "R"],
-) -> Int[np.ndarray, "V"]:
-    """The same rule, as if a ray went through every point of every triangle."""
-    kept = counted[sheets.region[sheets.faces]]
+    regions: Bool[np.ndarray, "R"],
+) -> None:
+    """Add what the same rule says of some solved regions, as if rays went through every point."""
+    kept = regions[sheets.region[sheets.faces]]
     corners = faces[sheets.faces[kept]]
     winding = sheets.winding[corners]
     # A triangle cut between its corners has the class of what is cut off it.
-    part = closed.share[kept].sum(axis=1)
-    touched = ~winding.any(axis=1)
-    label = np.zeros(len(sheets.winding), np.int8)
-    label[corners[(winding < 0).any(axis=1) | (touched & (part < 0))]] = INSIDE
-    label[corners[(winding > 0).any(axis=1) | (touched & (part >= 0))]] = OUT
-    return label
+    part = np.where(winding.any(axis=1), 0.0, closed.share[kept].sum(axis=1))
+    inside, out = np.zeros(len(label), bool), label == OUT
+    inside[corners[(winding < 0).any(axis=1) | (part < -_SLIVER)]] = True
+    out[corners[(winding > 0).any(axis=1) | (part > _SLIVER)]] = True
+    label[inside] = INSIDE
+    label[out] = OUT

@@ -22,7 +22,7 @@ from spt_jax.rays.exclusions import (
     counted_regions,
     mixed_regions,
 )
-from spt_jax.rays.labels import triangle_labels, triangle_labels_without_rays
+from spt_jax.rays.labels import add_labels_without_rays, triangle_labels
 from spt_jax.rays.levels import Overlaps, find_overlaps
 from spt_jax.rays.sheets import Map, Sheets, find_sheets
 from spt_jax.rays.vertex_winding import vertex_winding
@@ -105,7 +105,10 @@ class Measurement:
         if not self.exclusions.any:
             return self.closed_form.solved
         # A region that counts in part needs rays: they tell which part.
-        return self.closed_form.solved & ~mixed_regions(self.exclusions, self.sheets)
+        exactly = self.closed_form.solved & ~mixed_regions(self.exclusions, self.sheets)
+        return closed_form.without_entangled(
+            self.vertices, self.faces, self.sheets, self.closed_form, exactly
+        )
 
     @cached_property
     def beams(self) -> list[Probe]:
@@ -131,8 +134,9 @@ class Measurement:
         bounding = sheets.faces[by_rays[sheets.region[sheets.faces]]]
         probe = self._cast(*aim_at_sheets(self.vertices, self.faces, towards, sheets, bounding))
         # Other regions lie behind the same tiles; what is in none was not told from the triangles.
-        region = sheets.region[probe.everything.ends].max(axis=1, initial=-1)
-        kept = probe.everything.only(np.append(by_rays, True)[region])
+        region = sheets.region[probe.everything.ends]
+        mine = np.append(by_rays, False)[region].any(axis=1) | (region < 0).all(axis=1)
+        kept = probe.everything.only(mine)
         return replace(probe, overlaps=kept, everything=kept)
 
     def _cast(self, beam: Beam, points: ScreenPoints) -> Probe:
@@ -180,12 +184,12 @@ class Measurement:
             return np.sign(winding).astype(np.int8)
         if rule == "vertex":
             return counted_labels(self.exclusions, self.sheets, self.faces)
-        if self.closed_form is not None:
-            return triangle_labels_without_rays(
-                self.faces, self.sheets, self.closed_form, self._counted
-            )
         overlaps = [found.overlaps for found in self.beams]
-        return triangle_labels(self.faces, overlaps, len(self.vertices))
+        label = triangle_labels(self.faces, overlaps, len(self.vertices))
+        if self.closed_form is not None:
+            exactly = self._exactly & self._counted
+            add_labels_without_rays(label, self.faces, self.sheets, self.closed_form, exactly)
+        return label
 
     def gradient(self, kind: Gradient, rule: Rule) -> Float[np.ndarray, "V 3"]:
         """The boundary integral, or the paper's Eq. 9 ("vertex") or Eq. 10 ("unit")."""
