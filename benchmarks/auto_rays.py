@@ -21,7 +21,7 @@ from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.oracles import crossing_pairs, edges_of
 from benchmarks.references import REFERENCE_RAYS, Kept, Rays, Reference, by_rays, exact, sampling
 from spt_jax import load_body, load_mocap
-from spt_jax.rays import measure
+from spt_jax.overlap import measure
 
 PLAIN_RAYS = 512  # whose cost is the unit
 VOLUME_WITHIN, VOLUME_FLOOR, GRADIENT_WITHIN = 5e-3, 1e-9, 2e-2

@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float, Int
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap
-from spt_jax.rays.beam import aim, orthogonal_directions
-from spt_jax.rays.boundary import area_normals
-from spt_jax.rays.crossings import cast
-from spt_jax.rays.levels import find_overlaps
-from spt_jax.rays.vertex_winding import vertex_winding
+from spt_jax.overlap.boundary import area_normals
+from spt_jax.overlap.rays.beam import aim, orthogonal_directions
+from spt_jax.overlap.rays.crossings import cast
+from spt_jax.overlap.rays.levels import find_overlaps
+from spt_jax.overlap.triangles.vertex_winding import vertex_winding
 
 STEP = 1e-6
 RAYS = 512

@@ -134,7 +134,10 @@ def draw_singles(out: Path, body: BodyModel, singles: Singles) -> None:
     for key, picture in ((("Eq. 10", RATE), _PICTURES[0]), (("Eq. 9", RATE), _PICTURES[1])):
         run = singles.runs[key]
         posed = [body(run.snapshots[i // EVERY]).vertices for i in SHOWN]
-        labels = [classify_vertices(v, faces, directions=1, rays=512, rule="triangle").label for v in posed]
+        labels = [
+            classify_vertices(v, faces, directions=1, rays=512, rule="triangle").label
+            for v in posed
+        ]
         titles = [f"{i}: SPT {run.values[i].mean():.4f}" for i in SHOWN]
         render_strip(
             [list(row) for row in np.stack(posed, axis=1)],
@@ -168,7 +171,10 @@ def draw_pairs(out: Path, body: BodyModel, pairs: Pairs) -> None:
     render_strip(
         posed,
         pairs.faces,
-        [classify_vertices(v, pairs.faces, directions=1, rays=512, rule="triangle").label for v in posed],
+        [
+            classify_vertices(v, pairs.faces, directions=1, rays=512, rule="triangle").label
+            for v in posed
+        ],
         [
             f"{i}: within {k.own:.4f}, between {k.between:.4f}"
             for i, k in zip(SHOWN, kinds, strict=True)

@@ -170,7 +170,9 @@ def run_pairs(body: BodyModel, bars: Progress) -> Pairs:
         vertices = as_one_mesh(body, parameters)
         halves = vertices.reshape(2, count, 3)
         union = classify_vertices(vertices, faces, directions=1, rays=512, rule="triangle").clear
-        alone = classify_vertices(halves, body.faces, directions=1, rays=512, rule="triangle").clear.reshape(-1)
+        alone = classify_vertices(
+            halves, body.faces, directions=1, rays=512, rule="triangle"
+        ).clear.reshape(-1)
         volumes = self_intersection_penalty(halves, body.faces).sum()
         whole = self_intersection_penalty(vertices, faces)
         shares = jnp.mean(~alone), jnp.mean(~union & alone)

@@ -9,7 +9,7 @@ from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.untangle import LEAST_OVERLAP, colliding_frames
 from spt_jax import load_body, load_mocap
 from spt_jax.arguments import as_directions
-from spt_jax.rays.measure import Sampling, measure
+from spt_jax.overlap.measure import Sampling, measure
 
 REFERENCE_RAYS = 2048
 

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from spt_jax.arguments import as_directions
 from spt_jax.output_files import atomic_write
-from spt_jax.rays import measure
+from spt_jax.overlap import measure
 
 Rays = int | Literal["auto"]
 REFERENCE_RAYS = 4096

@@ -7,8 +7,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Integer
 
-from spt_jax.rays.beam import Rays, orthogonal_directions
-from spt_jax.rays.measure import Directions
+from spt_jax.overlap.measure import Directions
+from spt_jax.overlap.rays.beam import Rays, orthogonal_directions
 
 # A body at 4096 x 4096 rays takes 2 GB; four times that is more than most machines can spare.
 MOST_RAYS = 4096

@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Int8, Integer
 from spt_jax.arguments import as_choice, as_directions, as_mesh, as_rays
 from spt_jax.exclusions import as_exclusions
 from spt_jax.host import call_on_host
-from spt_jax.rays.exclusions import Exclusions
-from spt_jax.rays.labels import CLEAR, INSIDE, OUT
-from spt_jax.rays.measure import Rule, Sampling, measure, usable
-from spt_jax.rays.sheets import Map
+from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
+from spt_jax.overlap.measure import Rule, Sampling, measure, usable
+from spt_jax.overlap.triangles.sheets import Map
 from spt_jax.rest_surface import RestSurface
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jax.core import Tracer
 
-from spt_jax.rays.exclusions import Exclusions
+from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.rest_surface import RestSurface
 
 

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
-from spt_jax.rays.measure import Map
+from spt_jax.overlap.measure import Map
 
 _PIECE_BYTES = 96 * 1024
 

@@ -19,9 +19,9 @@ from spt_jax.arguments import (
 from spt_jax.exclusions import as_exclusions
 from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host
-from spt_jax.rays.exclusions import Exclusions
-from spt_jax.rays.measure import Gradient, Rule, Sampling, Value, measure, usable
-from spt_jax.rays.sheets import Map
+from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.measure import Gradient, Rule, Sampling, Value, measure, usable
+from spt_jax.overlap.triangles.sheets import Map
 from spt_jax.rest_surface import RestSurface
 
 

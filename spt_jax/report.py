@@ -10,9 +10,9 @@ from spt_jax.arguments import as_choice, as_directions, as_rays
 from spt_jax.exclusions import as_exclusions
 from spt_jax.host import parallel_map
 from spt_jax.mesh_check import one_mesh
-from spt_jax.rays.beam import Rays
-from spt_jax.rays.labels import CLEAR, INSIDE, OUT
-from spt_jax.rays.measure import Rule, Sampling, measure
+from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
+from spt_jax.overlap.measure import Rule, Sampling, measure
+from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 
 from spt_jax.body import load_body, load_mocap
-from spt_jax.rays.beam import aim, orthogonal_directions
-from spt_jax.rays.crossings import cast
-from spt_jax.rays.measure import Sampling
+from spt_jax.overlap.measure import Sampling
+from spt_jax.overlap.rays.beam import aim, orthogonal_directions
+from spt_jax.overlap.rays.crossings import cast
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

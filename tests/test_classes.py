@@ -19,9 +19,9 @@ from helpers import (
 )
 
 from spt_jax import VertexClasses, classify_vertices
-from spt_jax.rays.labels import triangle_labels
-from spt_jax.rays.levels import Overlaps
-from spt_jax.rays.measure import measure
+from spt_jax.overlap.labels import triangle_labels
+from spt_jax.overlap.measure import measure
+from spt_jax.overlap.rays.levels import Overlaps
 
 
 def labels(mesh, rays=256, directions=3):

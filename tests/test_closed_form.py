@@ -21,9 +21,9 @@ from helpers import (
 )
 from helpers_exact import exact_overlap
 
-from spt_jax.rays import closed_form
-from spt_jax.rays.measure import measure
-from spt_jax.rays.sheets import find_sheets
+from spt_jax.overlap.measure import measure
+from spt_jax.overlap.triangles import closed_form
+from spt_jax.overlap.triangles.sheets import find_sheets
 
 
 def solved(mesh):

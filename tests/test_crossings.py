@@ -18,10 +18,10 @@ from helpers import (
     winding_number,
 )
 
-from spt_jax.rays import crossings as crossings_module
-from spt_jax.rays.beam import ScreenPoints, aim, orthogonal_directions, screen_frame
-from spt_jax.rays.crossings import cast
-from spt_jax.rays.levels import find_overlaps, winding_numbers
+from spt_jax.overlap.rays import crossings as crossings_module
+from spt_jax.overlap.rays.beam import ScreenPoints, aim, orthogonal_directions, screen_frame
+from spt_jax.overlap.rays.crossings import cast
+from spt_jax.overlap.rays.levels import find_overlaps, winding_numbers
 
 
 def signs_per_ray(found):

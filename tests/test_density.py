@@ -18,12 +18,13 @@ from helpers import (
     sphere,
 )
 
-from spt_jax.rays import closed_form, density
-from spt_jax.rays.beam import orthogonal_directions
-from spt_jax.rays.crossings import cast
-from spt_jax.rays.levels import find_overlaps
-from spt_jax.rays.measure import measure
-from spt_jax.rays.tiles import Tiles
+from spt_jax.overlap.measure import measure
+from spt_jax.overlap.rays import density
+from spt_jax.overlap.rays.beam import orthogonal_directions
+from spt_jax.overlap.rays.crossings import cast
+from spt_jax.overlap.rays.levels import find_overlaps
+from spt_jax.overlap.rays.tiles import Tiles
+from spt_jax.overlap.triangles import closed_form
 
 
 @pytest.fixture(autouse=True)

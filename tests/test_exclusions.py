@@ -30,7 +30,7 @@ from spt_jax import (
     within_groups,
 )
 from spt_jax.exclusions import as_exclusions
-from spt_jax.rays.measure import measure
+from spt_jax.overlap.measure import measure
 
 # Three balls in a row: the first two overlap, and the last two.
 BALLS = [

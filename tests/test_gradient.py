@@ -17,8 +17,8 @@ from helpers import (
     sphere,
 )
 
-from spt_jax.rays.boundary import vertex_gradient
-from spt_jax.rays.measure import measure
+from spt_jax.overlap.boundary import vertex_gradient
+from spt_jax.overlap.measure import measure
 
 
 def value_and_gradient(mesh, rays, directions=3, kind="boundary"):

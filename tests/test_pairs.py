@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers import body_faces, box, join, moved, posed_bodies, random_rotation, sphere
 
-from spt_jax.rays import pair_boxes, pair_layout
-from spt_jax.rays.pairs import edge_crossings, face_pairs
+from spt_jax.overlap.triangles import pair_boxes, pair_layout
+from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 
 
 @pytest.fixture(autouse=True)

@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spt_jax import self_intersection_penalty
-from spt_jax.rays.measure import measure
+from spt_jax.overlap.measure import measure
 
 
 @pytest.mark.parametrize("value", ["volume", "ratio"])

@@ -23,7 +23,7 @@ from spt_jax.fit.contours import contour_forces
 from spt_jax.fit.spread import Spread, Surface
 from spt_jax.fit.untangle_mesh import untangle_mesh
 from spt_jax.mesh_files import read_mesh
-from spt_jax.rays.pairs import edge_crossings
+from spt_jax.overlap.triangles.pairs import edge_crossings
 
 
 def intersects(vertices, faces) -> bool:

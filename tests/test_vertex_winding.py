@@ -18,9 +18,9 @@ from helpers import (
 )
 from scipy.spatial import ConvexHull
 
-from spt_jax.rays import vertex_winding as module
-from spt_jax.rays.beam import orthogonal_directions
-from spt_jax.rays.vertex_winding import vertex_winding
+from spt_jax.overlap.rays.beam import orthogonal_directions
+from spt_jax.overlap.triangles import vertex_winding as module
+from spt_jax.overlap.triangles.vertex_winding import vertex_winding
 
 DIRECTIONS = np.array(orthogonal_directions(3))
 FRAMES = ["roll/0053", "crawl/0092", "dance_a/0068"]

@@ -21,7 +21,7 @@ from helpers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spt_jax.rays.measure import measure
+from spt_jax.overlap.measure import measure
 
 FINE = 512
 

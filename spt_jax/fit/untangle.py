@@ -17,10 +17,10 @@ from spt_jax.fit.spread import Surface
 from spt_jax.fit.untangle_mesh import untangle_checked
 from spt_jax.geometry import inflate
 from spt_jax.host import parallel_map
+from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.measure import Sampling, measure
+from spt_jax.overlap.rays.beam import Rays
 from spt_jax.penalty import self_intersection_penalty
-from spt_jax.rays.beam import Rays
-from spt_jax.rays.exclusions import Exclusions
-from spt_jax.rays.measure import Sampling, measure
 from spt_jax.rest_surface import RestSurface
 
 Folds = Literal["ignore", "remove", "count"]

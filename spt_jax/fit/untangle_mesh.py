@@ -13,8 +13,8 @@ from spt_jax.fit.freeing import free_vertices
 from spt_jax.fit.spread import Surface
 from spt_jax.host import parallel_map
 from spt_jax.mesh_check import check_mesh, one_mesh
-from spt_jax.rays.measure import Sampling, measure
-from spt_jax.rays.pairs import edge_crossings
+from spt_jax.overlap.measure import Sampling, measure
+from spt_jax.overlap.triangles.pairs import edge_crossings
 
 
 @dataclass(frozen=True)

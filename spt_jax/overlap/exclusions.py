@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.levels import Overlaps
-from spt_jax.rays.sheets import Sheets
+from spt_jax.overlap.rays.levels import Overlaps
+from spt_jax.overlap.triangles.sheets import Sheets
 
 # Between parts that no path along the rest surface connects.
 _UNCONNECTED = 1e6

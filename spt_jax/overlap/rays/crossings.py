@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.rays.beam import Beam, ScreenPoints
-from spt_jax.rays.tiles import Tiles
+from spt_jax.overlap.rays.beam import Beam, ScreenPoints
+from spt_jax.overlap.rays.tiles import Tiles
 
 # Depth is quantised only for the sort; below this many bits the packed key would confuse sheets
 # that are a few micrometres apart on a body, and a wider two-part sort takes over.

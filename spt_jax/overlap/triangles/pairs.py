@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.pair_boxes import (
+from spt_jax.overlap.triangles.pair_boxes import (
     Shape,
     concatenate,
     cross,
@@ -21,7 +21,7 @@ from spt_jax.rays.pair_boxes import (
     parts,
     spread,
 )
-from spt_jax.rays.pair_layout import Layout, Topology, prepared
+from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
 
 # Relative to the size of what is multiplied, far above float64's rounding.
 _ROUNDING = 1e-14
@@ -76,7 +76,7 @@ def edge_crossings(
 
     Example:
         >>> import numpy as np
-        >>> from spt_jax.rays.pairs import edge_crossings
+        >>> from spt_jax.overlap.triangles.pairs import edge_crossings
         >>> flat = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
         >>> upright = [[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
         >>> found = edge_crossings(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
@@ -125,7 +125,7 @@ def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
 
     Example:
         >>> import numpy as np
-        >>> from spt_jax.rays.pairs import edge_crossings, face_pairs
+        >>> from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
         >>> flat = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
         >>> upright = [[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
         >>> found = edge_crossings(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))

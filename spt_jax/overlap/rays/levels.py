@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.beam import Beam, ScreenPoints
-from spt_jax.rays.crossings import Crossings
+from spt_jax.overlap.rays.beam import Beam, ScreenPoints
+from spt_jax.overlap.rays.crossings import Crossings
 
 # A triangle seen edge-on is a line on the screen. Narrower than this, in pixels, rounding decides
 # which rays hit it and at which of its depths, and nothing on such a ray can be told.

@@ -11,11 +11,11 @@ rays than a fixed number.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.beam import Beam, ScreenPoints, on_lattice, square_pixel, turned_frame
-from spt_jax.rays.crossings import cast
-from spt_jax.rays.levels import find_overlaps
-from spt_jax.rays.sheets import Sheets, find_sheets
-from spt_jax.rays.tiles import Tiles, boxes
+from spt_jax.overlap.rays.beam import Beam, ScreenPoints, on_lattice, square_pixel, turned_frame
+from spt_jax.overlap.rays.crossings import cast
+from spt_jax.overlap.rays.levels import find_overlaps
+from spt_jax.overlap.rays.tiles import Tiles, boxes
+from spt_jax.overlap.triangles.sheets import Sheets, find_sheets
 
 # Rays along the longer side of the screen at refinement 0; tiles are two of its pixels wide.
 BASE_RAYS = 512
@@ -35,7 +35,7 @@ _LARGE = 256
 
 # Crossings this near to an edge or a vertex, as a part of the triangle, tell exact contact; and how
 # far the vertices are then shaken, as a part of the mesh's size: more than what counts as contact
-# in vertex_winding.py, and far less than a pixel.
+# in `triangles.vertex_winding`, and far less than a pixel.
 _CONTACT, _SHAKE = 1e-9, 1e-6
 
 

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.beam import screen_frame
-from spt_jax.rays.vertex_cone import within_cone
+from spt_jax.overlap.rays.beam import screen_frame
+from spt_jax.overlap.triangles.vertex_cone import within_cone
 
 # The rays lean from the direction that is asked for, by these parts of the screen's axes, and the
 # screen is turned about them: what is modelled has its faces and edges along the axes, and a face
@@ -29,7 +29,7 @@ _TURN = np.arctan((np.sqrt(5.0) - 1.0) / 2.0)
 # For vertices whose rays meet a hole in all of the caller's directions.
 _SPARE = np.array([[0.48, -0.36, -0.8], [-0.64, 0.6, -0.48]])
 
-# A sheet nearer to the vertex than this part of the mesh's size touches it, as in levels.py.
+# A sheet nearer to the vertex than this part of the mesh's size touches it, as in `rays.levels`.
 _THINNEST = 1e-7
 
 # How many strips the screen is cut into, and columns, for each root of the number of vertices.

@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Bool, Int
 
-from spt_jax.rays.closed_form import ClosedForm
-from spt_jax.rays.levels import Overlaps
-from spt_jax.rays.sheets import Sheets
+from spt_jax.overlap.rays.levels import Overlaps
+from spt_jax.overlap.triangles.closed_form import ClosedForm
+from spt_jax.overlap.triangles.sheets import Sheets
 
 CLEAR, OUT, INSIDE = 0, 1, -1
 

@@ -7,13 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays import closed_form
-from spt_jax.rays.beam import Beam, Rays, ScreenPoints, aim
-from spt_jax.rays.boundary import boundary_gradient, vertex_gradient
-from spt_jax.rays.closed_form import ClosedForm
-from spt_jax.rays.crossings import cast
-from spt_jax.rays.density import aim_at_sheets
-from spt_jax.rays.exclusions import (
+from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
+from spt_jax.overlap.exclusions import (
     NOTHING,
     Exclusions,
     colliding_pairs,
@@ -22,10 +17,15 @@ from spt_jax.rays.exclusions import (
     counted_regions,
     mixed_regions,
 )
-from spt_jax.rays.labels import add_labels_without_rays, triangle_labels
-from spt_jax.rays.levels import Overlaps, find_overlaps
-from spt_jax.rays.sheets import Map, Sheets, find_sheets
-from spt_jax.rays.vertex_winding import vertex_winding
+from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
+from spt_jax.overlap.rays.beam import Beam, Rays, ScreenPoints, aim
+from spt_jax.overlap.rays.crossings import cast
+from spt_jax.overlap.rays.density import aim_at_sheets
+from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
+from spt_jax.overlap.triangles import closed_form
+from spt_jax.overlap.triangles.closed_form import ClosedForm
+from spt_jax.overlap.triangles.sheets import Map, Sheets, find_sheets
+from spt_jax.overlap.triangles.vertex_winding import vertex_winding
 
 Directions = tuple[tuple[float, float, float], ...]
 Value = Literal["volume", "ratio"]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.rays.pair_layout import CLUSTER, Layout, Prepared
+from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 
 # Candidates handled at once: bounds the memory for any mesh. The posed body takes 17 ms with 2^14
 # of them, 12 with 2^16; with 2^18 the memory goes back to the system and is asked for anew.

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.rays.tiles import Tiles
+from spt_jax.overlap.rays.tiles import Tiles
 
 Rays = int | tuple[int, int] | Literal["auto"]
 

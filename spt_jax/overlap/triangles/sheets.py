@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from spt_jax.rays.pairs import EdgeCrossings, edge_crossings, face_pairs
-from spt_jax.rays.vertex_winding import vertex_winding
+from spt_jax.overlap.triangles.pairs import EdgeCrossings, edge_crossings, face_pairs
+from spt_jax.overlap.triangles.vertex_winding import vertex_winding
 
 # map(function, items); the caller may bring one that uses several threads.
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]

@@ -1,7 +1,7 @@
 """The overlap volume and its gradient in closed form, without rays.
 
 A triangle's share of the gradient at its corner t is its normal times the integral of
-c lambda_t over it (boundary.py), and c = sign(w_out) is constant but for jumps of one where other
+c lambda_t over it (`overlap.boundary`), and c = sign(w_out) is constant but for jumps of one where other
 triangles pass through. Where |w_out| <= 1, c is w_out itself, so Green's theorem in barycentric
 coordinates (u, v), with dF/du = lambda_t,
 
@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.rays.boundary import area_normals
-from spt_jax.rays.sheets import Sheets
+from spt_jax.overlap.boundary import area_normals
+from spt_jax.overlap.triangles.sheets import Sheets
 
 # What the sums with constants, of sides of length one, may leave.
 _GAP = 1e-6

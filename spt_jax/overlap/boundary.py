@@ -10,8 +10,8 @@ the surface area a / |n . d| of its triangle.
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.rays.beam import Beam
-from spt_jax.rays.levels import Overlaps
+from spt_jax.overlap.rays.beam import Beam
+from spt_jax.overlap.rays.levels import Overlaps
 
 
 def area_normals(

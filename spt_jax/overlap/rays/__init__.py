@@ -1,0 +1,1 @@
+"""Beams of parallel rays: what they cross, and the overlaps between the crossings."""

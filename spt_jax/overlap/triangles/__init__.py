@@ -1,0 +1,1 @@
+"""What the triangles tell by themselves, exactly: who crosses whom, what lies in what, volume."""
