@@ -1,7 +1,7 @@
 """The overlap volume and its gradient in closed form, without rays.
 
-A triangle's share of the gradient at its corner t is its normal times the integral of
-c lambda_t over it (`overlap.boundary`), and c = sign(w_out) is constant but for jumps of one where other
+A triangle's share of the gradient at its corner t is its normal times the integral of c lambda_t
+over it (`overlap.boundary`), and c = sign(w_out) is constant but for jumps of one where other
 triangles pass through. Where |w_out| <= 1, c is w_out itself, so Green's theorem in barycentric
 coordinates (u, v), with dF/du = lambda_t,
 
