@@ -112,9 +112,10 @@ def classify_vertices(
         >>> print(classes.ratio)
         0.5
     """
+    given = faces
     vertices, faces = as_mesh(vertices, faces)
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    exclusions = as_exclusions(face_groups, ignore_groups, folds, faces.shape[0])
+    exclusions = as_exclusions(face_groups, ignore_groups, folds, given)
     options = _Options(as_choice("rule", rule, Rule), sampling, exclusions)
     return VertexClasses(_labels(options, vertices, faces))
 

@@ -9,13 +9,14 @@ from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.rest_surface import RestSurface
 
 
-def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, num_faces: int) -> Exclusions:
+def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, faces: Any) -> Exclusions:
     """Which overlaps do not count, hashable.
 
     Raises:
         TypeError: traced groups, groups that are no whole numbers, folds that is no RestSurface.
-        ValueError: groups or folds of another number of faces; pairs that are no pairs of groups.
+        ValueError: groups or folds of other faces; pairs that are no pairs of groups.
     """
+    num_faces: int = np.shape(faces)[0]
     if folds is not None and not isinstance(folds, RestSurface):
         raise TypeError(
             f"folds must be a RestSurface or None: got {type(folds).__name__}; pass "
@@ -25,6 +26,11 @@ def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, num_faces: i
         raise ValueError(
             f"folds must be the rest surface of these faces: got one of {folds.num_faces} faces "
             f"for {num_faces}; for several bodies in one mesh take folds.copies(count)."
+        )
+    if folds is not None and not isinstance(faces, Tracer) and not folds.has_faces(faces):
+        raise ValueError(
+            "folds must be the rest surface of these faces: got one of other faces, though of as "
+            "many; make RestSurface(rest_vertices, faces) from the faces that you pass."
         )
     pairs = _as_pairs(ignore_groups)
     if face_groups is None:
@@ -60,7 +66,9 @@ def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, num_faces: i
 
 def _as_pairs(ignore_groups: Any) -> tuple[tuple[int, int], ...]:
     try:
-        pairs = np.asarray(ignore_groups if len(ignore_groups) else np.zeros((0, 2), int))
+        pairs: np.ndarray = np.asarray(
+            ignore_groups if len(ignore_groups) else np.zeros((0, 2), int)
+        )
     except (TypeError, ValueError):
         pairs = np.zeros(0)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.integer):

@@ -115,6 +115,7 @@ def self_intersection_penalty(
         >>> print(f"{push[0]:.1f}")
         -1.0
     """
+    given = faces
     vertices, faces = as_mesh(vertices, faces)
     as_backend(backend)
     apart = as_margin(margin)
@@ -123,7 +124,7 @@ def self_intersection_penalty(
         as_choice("gradient", gradient, Gradient),
         as_choice("rule", rule, Rule),
         Sampling(as_rays(rays), as_directions(directions)),
-        as_exclusions(face_groups, ignore_groups, folds, faces.shape[0]),
+        as_exclusions(face_groups, ignore_groups, folds, given),
     )
     if apart:
         vertices = inflate(vertices, faces, apart / 2)

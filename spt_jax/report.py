@@ -177,7 +177,7 @@ def intersection_report(
             "remove or restore them."
         )
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    exclusions = as_exclusions(face_groups, ignore_groups, folds, len(triangles))
+    exclusions = as_exclusions(face_groups, ignore_groups, folds, triangles)
     wanted = as_choice("rule", rule, Rule)
     found = measure(points, triangles, sampling, exclusions, parallel_map)
     return IntersectionReport(

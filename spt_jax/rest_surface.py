@@ -115,6 +115,15 @@ class RestSurface:
             raise ValueError(f"count must be a positive whole number: got {count!r}.")
         return self._derived(self.distance, self._copies * int(count))
 
+    def has_faces(self, faces: Any) -> bool:
+        """Whether these are the faces of the rest mesh, or of its copies one after the other."""
+        own, given = self._paths.faces, np.asarray(faces)
+        if given.shape != (self.num_faces, 3):
+            return False
+        copies = given.reshape(self._copies, len(own), 3)
+        step = len(self._paths.content.vertices)
+        return all(np.array_equal(copy - k * step, own) for k, copy in enumerate(copies))
+
     def _derived(self, distance: float, copies: int) -> "RestSurface":
         other = object.__new__(RestSurface)
         other._set(self._paths, distance, copies)

@@ -313,3 +313,21 @@ def test_a_region_that_does_not_close_is_refused():
     )
     broken = dataclasses.replace(sheets, crossings=less)
     assert not closed_form.solve(*mesh, broken).solved.any()
+
+
+def test_three_slabs_that_meet_in_points_without_edges_go_to_rays():
+    """Every edge of each slab lies outside the others, yet all three share a piece."""
+    bounds = [
+        ((-0.2, -1.1, -2), (0.2, 2.9, 2)),
+        ((-2.2, -0.2, -1), (1.8, 0.2, 3)),
+        ((-1.1, -2.1, -0.2), (2.9, 1.9, 0.2)),
+    ]
+    low, high = np.array(bounds).transpose(1, 0, 2)
+    slabs = join(*(box(h - l, (h + l) / 2) for l, h in zip(low, high, strict=True)))  # noqa: E741
+    found = measure(*slabs, sampling("auto"))
+    assert not found.closed_form.solved.any()
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    common = [np.minimum(high[i], high[j]) - np.maximum(low[i], low[j]) for i, j in pairs]
+    triple = np.prod(high.min(axis=0) - low.max(axis=0))
+    expected = sum(np.prod(size) for size in common) - triple  # what three cover counts twice
+    assert found.volume == pytest.approx(expected, rel=2e-3)

@@ -10,6 +10,7 @@ from helpers import (
     bent_tube,
     body_faces,
     boolean_overlap,
+    box,
     embedded_body,
     join,
     moved,
@@ -42,7 +43,7 @@ GROUPS = np.repeat([4, 0, 9], len(BALLS[0][1]))  # any numbers will do
 
 
 def measured(mesh, folds=None, groups=None, ignored=(), rays="auto"):
-    exclusions = as_exclusions(groups, ignored, folds, len(mesh[1]))
+    exclusions = as_exclusions(groups, ignored, folds, mesh[1])
     return measure(*mesh, sampling(rays), exclusions)
 
 
@@ -183,22 +184,20 @@ def differences(run, mesh, velocity, step):
 
 def test_gradient_with_folds_is_the_derivative_in_closed_form():
     rng = np.random.default_rng(1)
-    ring, rest = tube(0.4, 0.3, 0.1, 1.0, 80)
-    bent, bent_rest = knee()
-    for mesh, folds in ((ring, rest), (bent, bent_rest.within(0.0))):
-        exact = measured(mesh, folds).gradient("boundary", "vertex")
-        velocity = 0.1 * rng.normal(size=exact.shape)
-        numeric = differences(functools.partial(measured, folds=folds), mesh, velocity, 1e-5)
-        assert np.sum(exact * velocity) == pytest.approx(
-            numeric, abs=1e-6 * np.abs(exact * velocity).sum()
-        )
-        assert abs(numeric) > 1e-6
+    mesh, folds = tube(0.4, 0.3, 0.1, 1.0, 80)
+    exact = measured(mesh, folds).gradient("boundary", "vertex")
+    velocity = 0.1 * rng.normal(size=exact.shape)
+    numeric = differences(functools.partial(measured, folds=folds), mesh, velocity, 1e-5)
+    assert np.sum(exact * velocity) == pytest.approx(
+        numeric, abs=1e-6 * np.abs(exact * velocity).sum()
+    )
+    assert abs(numeric) > 1e-6
 
 
 def test_gradient_with_folds_where_rays_decide():
     """A body that both folds and collides: by rays of one direction, whose lattice stays."""
     mesh, folds = (posed_bodies(["roll/0056"])[0], body_faces()), embedded_body().rest_surface
-    exclusions = as_exclusions(None, (), folds, len(mesh[1]))
+    exclusions = as_exclusions(None, (), folds, mesh[1])
     run = lambda m: measure(*m, sampling("auto", 1), exclusions)  # noqa: E731
     exact = run(mesh).gradient("boundary", "vertex")
     rng = np.random.default_rng(2)
@@ -243,12 +242,45 @@ def test_equal_options_are_traced_once():
     rest = RestSurface(*ROW, distance=0.01)
     first = call(GROUPS, rest)
     before = penalty._penalty._cache_size()
-    same = as_exclusions(GROUPS, ((0, 4),), rest, len(ROW[1]))
+    same = as_exclusions(GROUPS, ((0, 4),), rest, ROW[1])
     for groups in (GROUPS.copy(), GROUPS.astype(np.int16), jnp.asarray(GROUPS)):
         again = RestSurface(ROW[0].copy(), ROW[1].astype(np.int32), distance=0.01)
         assert call(groups, again) == first
-        other = as_exclusions(groups, ((4, 0), (0, 4)), again, len(ROW[1]))
+        other = as_exclusions(groups, ((4, 0), (0, 4)), again, ROW[1])
         assert other == same and hash(other) == hash(same)
     assert penalty._penalty._cache_size() == before
-    assert as_exclusions(GROUPS, ((0, 9),), rest, len(ROW[1])) != same
-    assert as_exclusions(GROUPS + 0, ((0, 4),), rest.within(0.02), len(ROW[1])) != same
+    assert as_exclusions(GROUPS, ((0, 9),), rest, ROW[1]) != same
+    assert as_exclusions(GROUPS + 0, ((0, 4),), rest.within(0.02), ROW[1]) != same
+
+
+def test_a_part_within_another_is_of_its_group():
+    nested = join(box(), box((0.5, 0.4, 0.3), (0.01, 0.02, 0.03)))
+    groups = np.repeat([0, 1], 12)
+    vertices, faces = jnp.asarray(nested[0], "float32"), nested[1]
+    for ignored, part in ((((0, 1),), 0.0), (((0, 0),), 0.06)):
+        options = {"face_groups": groups, "ignore_groups": ignored}
+        value = self_intersection_penalty(vertices, faces, **options)
+        assert float(value) == pytest.approx(part, rel=1e-2)
+        assert float(classify_vertices(vertices, faces, **options).ratio) == (0.5 if part else 0)
+
+
+def test_turning_the_body_turns_no_fold_into_a_collision(rng):
+    """How much of a region counts that folds and collides depends on the rays; whether does not."""
+    rest = embedded_body().rest_surface
+    for name, collides in (("run/0005", False), ("cartwheel/0103", True)):
+        (vertices,) = posed_bodies([name])
+        for _ in range(3):
+            turned = vertices @ random_rotation(rng).T
+            found = intersection_report(turned, body_faces(), folds=rest)
+            assert (found.volume > 0) == collides
+            assert (found.crossing_pairs[0] > 0) == collides
+
+
+def test_the_rest_surface_of_other_faces_is_refused(untyped):
+    body = embedded_body()
+    vertices, faces = jnp.asarray(body.template, "float32"), np.asarray(body.faces)
+    with pytest.raises(ValueError, match="folds must be the rest surface of these faces"):
+        self_intersection_penalty(vertices, faces[::-1].copy(), folds=body.rest_surface)
+    scene = join_bodies(jnp.stack([vertices, vertices + 3.0]), faces)
+    folds = body.rest_surface.copies(2)
+    assert self_intersection_penalty(scene.vertices, scene.faces, folds=folds) == 0

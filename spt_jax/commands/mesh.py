@@ -23,7 +23,7 @@ _BINARY = (".ply", ".glb", ".stl")
 def untangle_mesh_file(
     path: Path, out: Path, *, meshes: bool, rays: int | Literal["auto"], json: bool, quiet: bool
 ) -> int:
-    """Free one mesh; the exit code is 0 if nothing crosses any more, and 1 otherwise."""
+    """Free one mesh; the exit code is 0 if no overlap is left, and 1 otherwise."""
     from spt_jax.arguments import as_rays
     from spt_jax.mesh_check import check_mesh
     from spt_jax.mesh_files import read_mesh
@@ -55,7 +55,7 @@ def untangle_mesh_file(
         state("writing", done=1)
         report: dict[str, Any] = {
             "command": "untangle",
-            "settings": {"mesh": str(path), "rays": rays, "directions": 3},
+            "settings": {"mesh": str(path), "directions": 3, **sampling},
             **result.as_dict(),
             "seconds": round(seconds, 3),
             "notes": notes,
@@ -84,7 +84,14 @@ def untangle_mesh_file(
             "by hand where they are deepest, or refine the mesh there",
             "red",
         )
-    return 0 if result.free else 1
+    elif result.after.volume > 0:
+        show(
+            err_console(quiet),
+            f"nothing crosses, but {result.after.volume:.4g} units³ of overlap are left: a part "
+            "that lies within another whole is not pushed out; move it by hand",
+            "red",
+        )
+    return 0 if result.free and not result.after.volume > 0 else 1
 
 
 def _table(result: "UntangleMeshResult", seconds: float) -> "Table":

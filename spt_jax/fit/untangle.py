@@ -259,7 +259,8 @@ class _Search(eqx.Module):
         """Margin and weight of every descent."""
         if self.folds == "count":
             return [(0.0, weight) for weight in self.weights]
-        again = [(self.margin * wider, w) for wider in _WIDER for w in self.weights[-_AGAIN:]]
+        wider = _WIDER if self.margin else ()
+        again = [(self.margin * more, w) for more in wider for w in self.weights[-_AGAIN:]]
         return [(self.margin, weight) for weight in self.weights] + again
 
 

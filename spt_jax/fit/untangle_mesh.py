@@ -13,7 +13,7 @@ from spt_jax.fit.freeing import free_vertices
 from spt_jax.fit.spread import Surface
 from spt_jax.host import parallel_map
 from spt_jax.mesh_check import check_mesh, one_mesh
-from spt_jax.overlap.measure import Sampling, measure
+from spt_jax.overlap.measure import Directions, Sampling, measure
 from spt_jax.overlap.triangles.pairs import edge_crossings
 
 
@@ -180,11 +180,11 @@ def untangle_checked(
     freed = found.vertices.astype(vertices.dtype)  # exact: the search ends on values of this dtype
     shift = np.linalg.norm(found.vertices - vertices.astype(np.float64), axis=1)
     shift = shift[shift > 0]
-    before = _overlap(vertices, surface, sampling)
+    before = _overlap(vertices, surface, sampling.directions)
     return UntangleMeshResult(
         vertices=freed,
         before=before,
-        after=_overlap(freed, surface, sampling) if len(shift) else before,
+        after=_overlap(freed, surface, sampling.directions) if len(shift) else before,
         moved=len(shift),
         median_displacement=float(np.median(shift)) if len(shift) else 0.0,
         largest_displacement=float(shift.max(initial=0.0)),
@@ -193,12 +193,12 @@ def untangle_checked(
 
 
 def _overlap(
-    vertices: Float[np.ndarray, "V 3"], surface: Surface, sampling: Sampling
+    vertices: Float[np.ndarray, "V 3"], surface: Surface, directions: Directions
 ) -> MeshOverlap:
     points = vertices.astype(np.float64)
     if not len(surface.faces):
         return MeshOverlap(0.0, 0.0, 0)
-    found = measure(points, surface.faces, sampling, map_tasks=parallel_map)
+    found = measure(points, surface.faces, Sampling("auto", directions), map_tasks=parallel_map)
     return MeshOverlap(
         volume=float(found.volume),
         ratio=float(np.mean(found.labels("vertex") != 0)),

@@ -70,19 +70,24 @@ def colliding_pairs(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, 
 
 
 def counted_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
-    """Which regions of overlap count: those without a rim, and those whose rim has a collision."""
+    """Which regions of overlap may count: those whose rim has a collision, or that have no rim."""
     region = sheets.region[sheets.pairs[:, 0]]
     rim = np.bincount(region, minlength=sheets.num_regions)
     collides = colliding_pairs(exclusions, sheets)
     return (rim == 0) | (np.bincount(region, collides, sheets.num_regions) > 0)
 
 
+def rimless_regions(sheets: Sheets) -> Bool[np.ndarray, "R"]:
+    """Which regions nothing crosses: parts that lie within another whole, or inside out."""
+    return np.bincount(sheets.region[sheets.pairs[:, 0]], minlength=sheets.num_regions) == 0
+
+
 def mixed_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
-    """Which regions have collisions along a part of their rim only."""
+    """Which regions the triangles do not decide: no rim, or collisions along a part of it only."""
     region = sheets.region[sheets.pairs[:, 0]]
     rim = np.bincount(region, minlength=sheets.num_regions)
     collides = np.bincount(region, colliding_pairs(exclusions, sheets), sheets.num_regions)
-    return (collides > 0) & (collides < rim)
+    return (rim == 0) | ((collides > 0) & (collides < rim))
 
 
 def counted_intervals(
@@ -105,14 +110,14 @@ def counted_intervals(
 
 
 def counted_labels(
-    exclusions: Exclusions, sheets: Sheets, faces: Int[np.ndarray, "F 3"]
+    sheets: Sheets, faces: Int[np.ndarray, "F 3"], counted: Bool[np.ndarray, "R"]
 ) -> Int[np.ndarray, "V"]:
     """The vertices' classes sign(w_out), 0 where their region of overlap does not count."""
     label = np.sign(sheets.winding).astype(np.int8)
-    if exclusions.any:
-        counted = counted_regions(exclusions, sheets)[sheets.region[sheets.faces]]
+    if not counted.all():
+        touched = counted[sheets.region[sheets.faces]]
         kept = np.zeros(len(label), bool)
-        kept[faces[sheets.faces[counted]]] = True
+        kept[faces[sheets.faces[touched]]] = True
         label[~kept] = 0
     return label
 

@@ -20,7 +20,7 @@ def triangle_labels(
 
     The paper appends a triangle's corners to a set at every crossing and does not say what a
     vertex is that lands in several. Here V_out goes before V_in and both go before V_0, so the
-    penalty vanishes only when no ray sees an overlap. A vertex that no ray reaches is V_0.
+    ratio vanishes only when no ray sees an overlap. A vertex that no ray reaches is V_0.
     """
     label = np.zeros(num_vertices, np.int8)
     for value in (INSIDE, OUT):

@@ -16,6 +16,7 @@ from spt_jax.overlap.exclusions import (
     counted_labels,
     counted_regions,
     mixed_regions,
+    rimless_regions,
 )
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
 from spt_jax.overlap.rays.beam import Beam, Rays, ScreenPoints, aim
@@ -94,9 +95,17 @@ class Measurement:
 
     @cached_property
     def _counted(self) -> Bool[np.ndarray, "R"]:
-        if self.exclusions.any:
-            return counted_regions(self.exclusions, self.sheets)
-        return np.ones(self.sheets.num_regions, bool)
+        if not self.exclusions.any:
+            return np.ones(self.sheets.num_regions, bool)
+        counted = counted_regions(self.exclusions, self.sheets)
+        rimless = rimless_regions(self.sheets)
+        if (counted & rimless).any():
+            # Only rays tell what they lie in.
+            seen = np.zeros(self.sheets.num_regions + 1, bool)
+            for found in self.beams:
+                seen[self.sheets.region[found.overlaps.ends]] = True
+            counted &= ~rimless | seen[:-1]
+        return counted
 
     @cached_property
     def _exactly(self) -> Bool[np.ndarray, "R"]:
@@ -135,7 +144,8 @@ class Measurement:
         probe = self._cast(*aim_at_sheets(self.vertices, self.faces, towards, sheets, bounding))
         # Other regions lie behind the same tiles; what is in none was not told from the triangles.
         region = sheets.region[probe.everything.ends]
-        mine = np.append(by_rays, False)[region].any(axis=1) | (region < 0).all(axis=1)
+        own = np.append(by_rays, False)[region]
+        mine = own[:, 0] | own[:, 1] | (region < 0).all(axis=1)
         kept = probe.everything.only(mine)
         return replace(probe, overlaps=kept, everything=kept)
 
@@ -183,7 +193,7 @@ class Measurement:
             winding = vertex_winding(self.vertices, self.faces, directions)
             return np.sign(winding).astype(np.int8)
         if rule == "vertex":
-            return counted_labels(self.exclusions, self.sheets, self.faces)
+            return counted_labels(self.sheets, self.faces, self._counted)
         overlaps = [found.overlaps for found in self.beams]
         label = triangle_labels(self.faces, overlaps, len(self.vertices))
         if self.closed_form is not None:

@@ -32,6 +32,15 @@ _GAP = 1e-6
 # Sum of a region's gradient, against the sum of its parts' sizes.
 _CLOSED = 1e-6
 
+# Regions compared with all others together.
+_AT_ONCE = 64
+
+# More segments than this on one triangle are not compared with each other; rays take over.
+_MOST_SEGMENTS = 2000
+
+# Segments that meet within this part of their lengths from an end do not cross there.
+_AT_END = 1e-6
+
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # (u, v) of a triangle's corners
 
 
@@ -68,8 +77,11 @@ def solve(
     jump = -np.sign(np.einsum("ki,ki->k", left, normals[row[foreign]]))
     cusps = segments.cusps(faces, row, own, jump)
     sums, sound, deep = _sides(vertices, faces, sheets, row, cusps)
-    on_own = (_coordinates(vertices, corners[row[own]], normals[row[own]], x) for x in (start, end))
-    np.add.at(sums, row[own], jump[:, None] * _along(*on_own))
+    start, end = (
+        _coordinates(vertices, corners[row[own]], normals[row[own]], x) for x in (start, end)
+    )
+    np.add.at(sums, row[own], jump[:, None] * _along(start, end))
+    deep |= _crossed(row[own], start, end, len(found))
     sound &= (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
     sound[row[segments.unmatched]] = False
 
@@ -145,11 +157,13 @@ def _without_entangled(points, region, solved, may_be_hollow, hollow) -> Bool[np
     solved = solved.copy()
     left = np.flatnonzero(~solved)
     while len(left):
-        around = (low <= low[left, None]).all(axis=2) & (high >= high[left, None]).all(axis=2)
-        within = (low >= low[left, None]).all(axis=2) & (high <= high[left, None]).all(axis=2)
-        entangled = (around & may_be_hollow[left, None]) | (within & hollow)
-        left = np.flatnonzero(solved & entangled.any(axis=0))
-        solved[left] = False
+        now, left = left[:_AT_ONCE], left[_AT_ONCE:]
+        around = (low <= low[now, None]).all(axis=2) & (high >= high[now, None]).all(axis=2)
+        within = (low >= low[now, None]).all(axis=2) & (high <= high[now, None]).all(axis=2)
+        entangled = (around & may_be_hollow[now, None]) | (within & hollow)
+        more = np.flatnonzero(solved & entangled.any(axis=0))
+        solved[more] = False
+        left = np.concatenate([left, more])
     return solved
 
 
@@ -169,6 +183,31 @@ def _along(start, end) -> Float[np.ndarray, "K 5"]:
     step = end - start
     integrals = np.einsum("p,pkc->kc", [1 / 6, 4 / 6, 1 / 6], field) * step[:, 1, None]
     return np.concatenate([integrals, step], axis=1)
+
+
+def _crossed(row, start, end, count: int) -> Bool[np.ndarray, "H"]:
+    """Triangles on which two segments cross: three parts meet there, and may lie in one place."""
+    order = np.argsort(row, kind="stable")
+    row, start, end = row[order], start[order], end[order]
+    number = np.bincount(row, minlength=count)
+    crossed = number > _MOST_SEGMENTS
+    # Each segment against those after it on the same triangle.
+    last = np.cumsum(number)[row]
+    later = np.where(crossed[row], 0, last - np.arange(len(row)) - 1)
+    first = np.repeat(np.arange(len(row)), later)
+    second = np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later) + first + 1
+
+    def cuts(a, b, c, d):
+        # Whether the line through a and b passes between c and d; not at an end, where the
+        # segments of neighbouring triangles meet.
+        u, v = b - a, np.stack([c - a, d - a])
+        turn = u[:, 0] * v[..., 1] - u[:, 1] * v[..., 0]
+        width = np.abs(turn[0] - turn[1])
+        return (turn[0] * turn[1] < 0) & (np.abs(turn).min(axis=0) > _AT_END * width)
+
+    one, other = (start[first], end[first]), (start[second], end[second])
+    crossed[row[first[cuts(*one, *other) & cuts(*other, *one)]]] = True
+    return crossed
 
 
 def _sides(vertices, faces, sheets: Sheets, row, cusps: "_Cusps"):
