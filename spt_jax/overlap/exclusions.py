@@ -8,6 +8,8 @@ every end of the other. Intervals at triangles which collide at the rim count to
 that counts never weighs nothing.
 """
 
+import functools
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -60,43 +62,57 @@ class Exclusions(NamedTuple):
 NOTHING = Exclusions()
 
 
-def colliding_pairs(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "P"]:
-    """Which of the triangles that pass through each other collide, by groups and rest distance."""
+@dataclass(frozen=True)
+class Rims:
+    """What the triangles that pass through each other say of the regions of overlap.
+
+    Attributes:
+        collides: which pairs of `Sheets.pairs` collide, by groups and rest distance.
+        pairs: how many pairs run along each region's rim.
+        colliding: how many of those collide.
+    """
+
+    collides: Bool[np.ndarray, "P"]
+    pairs: Int[np.ndarray, "R"]
+    colliding: Int[np.ndarray, "R"]
+
+    @property
+    def rimless(self) -> Bool[np.ndarray, "R"]:
+        """Regions that nothing crosses: parts that lie within another whole, or inside out."""
+        return self.pairs == 0
+
+    @property
+    def may_count(self) -> Bool[np.ndarray, "R"]:
+        """Regions that have a collision along their rim, or no rim."""
+        return self.rimless | (self.colliding > 0)
+
+    @property
+    def undecided(self) -> Bool[np.ndarray, "R"]:
+        """Regions that the triangles do not decide: no rim, or collisions along a part of it."""
+        return self.rimless | ((self.colliding > 0) & (self.colliding < self.pairs))
+
+
+def judge_rims(exclusions: Exclusions, sheets: Sheets) -> Rims:
+    """Which crossings of triangles collide, and what that makes of the regions."""
     f, g = sheets.pairs.T
     collides = ~_ignored(exclusions, f, g)
     if exclusions.rest is not None:
         collides &= ~exclusions.rest.near(f, g, exact=True)
-    return collides
-
-
-def counted_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
-    """Which regions of overlap may count: those whose rim has a collision, or that have no rim."""
-    region = sheets.region[sheets.pairs[:, 0]]
-    rim = np.bincount(region, minlength=sheets.num_regions)
-    collides = colliding_pairs(exclusions, sheets)
-    return (rim == 0) | (np.bincount(region, collides, sheets.num_regions) > 0)
-
-
-def rimless_regions(sheets: Sheets) -> Bool[np.ndarray, "R"]:
-    """Which regions nothing crosses: parts that lie within another whole, or inside out."""
-    return np.bincount(sheets.region[sheets.pairs[:, 0]], minlength=sheets.num_regions) == 0
-
-
-def mixed_regions(exclusions: Exclusions, sheets: Sheets) -> Bool[np.ndarray, "R"]:
-    """Which regions the triangles do not decide: no rim, or collisions along a part of it only."""
-    region = sheets.region[sheets.pairs[:, 0]]
-    rim = np.bincount(region, minlength=sheets.num_regions)
-    collides = np.bincount(region, colliding_pairs(exclusions, sheets), sheets.num_regions)
-    return (rim == 0) | ((collides > 0) & (collides < rim))
+    region, count = sheets.region[f], sheets.num_regions
+    return Rims(
+        collides,
+        np.bincount(region, minlength=count),
+        np.bincount(region[collides], minlength=count),
+    )
 
 
 def counted_intervals(
-    exclusions: Exclusions, sheets: Sheets, beams: list[Overlaps]
+    exclusions: Exclusions, sheets: Sheets, rims: Rims, beams: list[Overlaps]
 ) -> list[Bool[np.ndarray, "N"]]:
     """Which intervals of each beam count."""
-    allowed = np.append(counted_regions(exclusions, sheets), True)  # -1: in no region
+    allowed = np.append(rims.may_count, True)  # -1: in no region
     collides = np.zeros(len(sheets.region), bool)
-    collides[sheets.pairs[colliding_pairs(exclusions, sheets)]] = True
+    collides[sheets.pairs[rims.collides]] = True
     # What folds has few sheets far from each other, and one end at the rim will do. Groups tell
     # the sheets apart by themselves: of two bodies, one end would add 6 % of folds to what is
     # between them, both ends add 0.2 %.
@@ -158,25 +174,24 @@ def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
 def _ignored(exclusions: Exclusions, f, g) -> Bool[np.ndarray, "N"]:
     if exclusions.groups is None or not exclusions.ignored:
         return np.zeros(len(f), bool)
-    groups, ignored = _group_table(exclusions)
+    groups, ignored = _group_table(exclusions.groups, exclusions.ignored)
     return ignored[groups[f], groups[g]]
 
 
 def _group_distance(exclusions: Exclusions, f, g) -> Float[np.ndarray, "N"]:
     if exclusions.groups is None:
         return np.zeros(len(f))
-    groups, _ = _group_table(exclusions)
+    groups, _ = _group_table(exclusions.groups, exclusions.ignored)
     return 1.0 * (groups[f] != groups[g])
 
 
-def _group_table(exclusions: Exclusions):
+@functools.lru_cache(maxsize=8)
+def _group_table(groups: bytes, pairs: tuple[tuple[int, int], ...]):
     """Each face's group as a row of a table of the ignored pairs, and that table."""
-    names, groups = np.unique(
-        np.frombuffer(exclusions.groups or b"", np.int64), return_inverse=True
-    )
+    names, row = np.unique(np.frombuffer(groups, np.int64), return_inverse=True)
     ignored = np.zeros((len(names), len(names)), bool)
-    for pair in exclusions.ignored:
+    for pair in pairs:
         at = np.searchsorted(names, pair)
         if (at < len(names)).all() and (names[at] == pair).all():
             ignored[at[0], at[1]] = ignored[at[1], at[0]] = True
-    return groups, ignored
+    return row, ignored

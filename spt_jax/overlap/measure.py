@@ -11,12 +11,10 @@ from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
 from spt_jax.overlap.exclusions import (
     NOTHING,
     Exclusions,
-    colliding_pairs,
+    Rims,
     counted_intervals,
     counted_labels,
-    counted_regions,
-    mixed_regions,
-    rimless_regions,
+    judge_rims,
 )
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
 from spt_jax.overlap.rays.beam import Beam, Rays, ScreenPoints, aim
@@ -94,17 +92,20 @@ class Measurement:
         return closed_form.solve(self.vertices, self.faces, self.sheets)
 
     @cached_property
+    def _rims(self) -> Rims:
+        return judge_rims(self.exclusions, self.sheets)
+
+    @cached_property
     def _counted(self) -> Bool[np.ndarray, "R"]:
         if not self.exclusions.any:
             return np.ones(self.sheets.num_regions, bool)
-        counted = counted_regions(self.exclusions, self.sheets)
-        rimless = rimless_regions(self.sheets)
-        if (counted & rimless).any():
+        counted, rimless = self._rims.may_count, self._rims.rimless
+        if rimless.any():
             # Only rays tell what they lie in.
             seen = np.zeros(self.sheets.num_regions + 1, bool)
             for found in self.beams:
                 seen[self.sheets.region[found.overlaps.ends]] = True
-            counted &= ~rimless | seen[:-1]
+            counted = counted & (~rimless | seen[:-1])
         return counted
 
     @cached_property
@@ -114,7 +115,7 @@ class Measurement:
         if not self.exclusions.any:
             return self.closed_form.solved
         # A region that counts in part needs rays: they tell which part.
-        exactly = self.closed_form.solved & ~mixed_regions(self.exclusions, self.sheets)
+        exactly = self.closed_form.solved & ~self._rims.undecided
         return closed_form.without_entangled(
             self.vertices, self.faces, self.sheets, self.closed_form, exactly
         )
@@ -127,7 +128,7 @@ class Measurement:
         found = list(self.map_tasks(self._along, self.sampling.directions))
         if self.exclusions.any:
             counted = counted_intervals(
-                self.exclusions, self.sheets, [probe.everything for probe in found]
+                self.exclusions, self.sheets, self._rims, [probe.everything for probe in found]
             )
             found = [
                 replace(probe, overlaps=probe.everything.only(kept))
@@ -181,7 +182,7 @@ class Measurement:
     @property
     def crossing_pairs(self) -> int:
         """Pairs of triangles that pass through each other and count."""
-        return int(np.count_nonzero(colliding_pairs(self.exclusions, self.sheets)))
+        return int(np.count_nonzero(self._rims.collides))
 
     def labels(self, rule: Rule) -> Int[np.ndarray, "V"]:
         """V_0, V_out and V_in of the overlaps that count.

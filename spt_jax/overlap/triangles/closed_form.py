@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.overlap.boundary import area_normals
-from spt_jax.overlap.triangles.sheets import Sheets
+from spt_jax.overlap.boundary import area_normals, summed
+from spt_jax.overlap.triangles.sheets import Sheets, shared_corners
 
 # What the sums with constants, of sides of length one, may leave.
 _GAP = 1e-6
@@ -103,11 +103,8 @@ def gradient(
     kept = np.flatnonzero(regions[sheets.region[sheets.faces]])
     corners = faces[sheets.faces[kept]]
     normals = area_normals(vertices, corners)
-    total = np.empty(vertices.shape)
-    for axis in range(3):
-        part = (closed.share[kept] * normals[:, axis, None]).ravel()
-        total[:, axis] = np.bincount(corners.ravel(), part, len(vertices))
-    return total
+    pull = closed.share[kept][:, :, None] * normals[:, None, :]
+    return summed(corners.ravel(), pull.reshape(-1, 3), len(vertices))
 
 
 def without_entangled(
@@ -125,19 +122,14 @@ def without_entangled(
 
 def _volumes(points, normals, share, region, fits, shallow) -> ClosedForm:
     count = len(fits)
-    center = np.zeros((count, 3))
     faces_in = np.maximum(np.bincount(region, minlength=count), 1)
-    for axis in range(3):
-        center[:, axis] = np.bincount(region, points[:, :, axis].mean(axis=1), count) / faces_in
+    center = summed(region, points.mean(axis=1), count) / faces_in[:, None]
     pull = share[:, :, None] * normals[:, None, :]
     arm = points - center[region][:, None, :]
     volume = np.bincount(region, np.einsum("kci,kci->k", arm, pull), count) / 3
     size = np.bincount(region, np.abs(pull).sum(axis=(1, 2)), count)
-    closed = np.ones(count, bool)
-    for axis in range(3):
-        total = np.bincount(region, pull[:, :, axis].sum(axis=1), count)
-        closed &= np.abs(total) <= _CLOSED * size
-    fits = fits & closed
+    total = np.abs(summed(region, pull.sum(axis=1), count))
+    fits = fits & (total <= _CLOSED * size[:, None]).all(axis=1)
     solved = _without_entangled(points, region, fits & shallow, (volume < 0) | ~fits, volume < 0)
     return ClosedForm(solved, np.where(solved, volume, 0.0), share)
 
@@ -338,9 +330,7 @@ def _segments(vertices, faces, sheets: Sheets) -> _Segments:
     low, high = np.minimum(edge_face, other)[kept], np.maximum(edge_face, other)[kept]
     point = point[kept]
     # A vertex that the two triangles share is an end of their segment, and is put first.
-    first, second = faces[sheets.pairs[:, 0]], faces[sheets.pairs[:, 1]]
-    shared_by, corner = np.nonzero((first[:, :, None] == second[:, None, :]).any(axis=2))
-    shared = first[shared_by, corner]
+    shared_by, shared = shared_corners(faces, sheets.pairs)
     key = np.concatenate([sheets.pairs[shared_by] @ np.array([count, 1]), low * count + high])
     point = np.concatenate([vertices[shared], point])
     cusp = np.concatenate([shared, np.full(len(low), -1)])

@@ -72,7 +72,7 @@ def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
         return 0, region
     corners = faces[found]
     binding = winding != 0
-    binding[shared_corners(faces, pairs)] = True
+    binding[shared_corners(faces, pairs)[1]] = True
     row, corner = np.nonzero(binding[corners])
     node = np.full(len(faces), -1)
     node[found] = np.arange(len(found))
@@ -87,7 +87,8 @@ def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
 
 def shared_corners(
     faces: Int[np.ndarray, "F 3"], pairs: Int[np.ndarray, "P 2"]
-) -> Int[np.ndarray, "C"]:
-    """The vertices that two triangles share which pass through each other."""
+) -> tuple[Int[np.ndarray, "C"], Int[np.ndarray, "C"]]:
+    """Pairs whose two triangles share a vertex, as rows of `pairs`, and that vertex."""
     first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
-    return np.unique(first[(first[:, :, None] == second[:, None, :]).any(axis=2)])
+    row, corner = np.nonzero((first[:, :, None] == second[:, None, :]).any(axis=2))
+    return row, first[row, corner]
