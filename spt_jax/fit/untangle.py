@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
 from spt_jax.fit.spread import Surface
-from spt_jax.fit.untangle_mesh import untangle_checked
+from spt_jax.fit.untangle_mesh import SEARCH_RAYS, untangle_checked
 from spt_jax.geometry import inflate
 from spt_jax.host import parallel_map
 from spt_jax.overlap.exclusions import Exclusions
@@ -36,9 +36,6 @@ _WEIGHTS = (0.01, 0.1, 1.0, 10.0, 100.0)
 _STIFFNESS = 1e-3
 
 _CENTIMETRE = 0.01
-
-# For what the vertices have to do once the pose is free, as untangle_mesh's own default.
-_MESH_RAYS = 256
 
 # What is tried where the weights did not free a pose: the margin, times this, with the last weights
 # again from where the last attempt ended.
@@ -311,7 +308,7 @@ def _untangle_one(
             if search.is_free(after) or stuck or not np.isfinite(overlap.volume):
                 break
     if surface is not None and int(after.total_crossings):
-        sampling = Sampling(_MESH_RAYS, search.directions)
+        sampling = Sampling(SEARCH_RAYS, search.directions)
         freed = untangle_checked(np.asarray(vertices), surface, sampling).vertices
         vertices = jnp.asarray(freed)
         after = search.measure(vertices, body.faces)

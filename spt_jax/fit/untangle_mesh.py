@@ -16,6 +16,9 @@ from spt_jax.mesh_check import check_mesh, one_mesh
 from spt_jax.overlap.measure import Directions, Sampling, measure
 from spt_jax.overlap.triangles.pairs import edge_crossings
 
+# The search needs no more: the last crossings go by their contours, which no ray has to see.
+SEARCH_RAYS = 256
+
 
 @dataclass(frozen=True)
 class MeshOverlap:
@@ -74,7 +77,7 @@ def untangle_mesh(
     vertices: Float[Array, "V 3"] | np.ndarray,
     faces: Int[Array, "F 3"] | np.ndarray,
     *,
-    rays: int = 256,
+    rays: int = SEARCH_RAYS,
     directions: Any = 3,
     attempts: int = 4,
     steps_per_attempt: int = 40,

@@ -15,6 +15,7 @@ from spt_jax.overlap.rays.beam import Beam, ScreenPoints, on_lattice, square_pix
 from spt_jax.overlap.rays.crossings import cast
 from spt_jax.overlap.rays.levels import find_overlaps
 from spt_jax.overlap.rays.tiles import Tiles, boxes
+from spt_jax.overlap.triangles.segments import find_segments
 from spt_jax.overlap.triangles.sheets import Sheets, find_sheets
 
 # Rays along the longer side of the screen at refinement 0; tiles are two of its pixels wide.
@@ -104,7 +105,10 @@ def _mark(vertices, faces, sheets, bounding, beam, points, size) -> Bool[np.ndar
         marked |= _seen(vertices, faces, beam, size, suspect)
         triangles = bounding[large]
         corner = vertices[faces[triangles]]
-        rims = _segments(sheets, triangles)
+        segments = find_segments(vertices, faces, sheets)
+        first, second = segments.pair.T
+        segments = segments.only(np.isin(first, triangles) | np.isin(second, triangles))
+        rims = segments.start, segments.end
         outline = corner.reshape(-1, 3), np.roll(corner, -1, axis=1).reshape(-1, 3)
         for start, end in (rims, outline):
             marked |= _along(start, end, beam, size, shape)
@@ -162,19 +166,3 @@ def _along(start, end, beam: Beam, size: int, shape) -> Bool[np.ndarray, "R C"]:
             inside = (r >= 0) & (r < shape[0]) & (c >= 0) & (c < shape[1])
             marked[r[inside], c[inside]] = True
     return marked
-
-
-def _segments(sheets: Sheets, large: Int[np.ndarray, "L"]):
-    """The ends of the segments along which other triangles cross the large ones."""
-    crossings = sheets.crossings
-    edge_face = crossings.edge_faces.T.ravel()
-    face = np.tile(crossings.face, 2)
-    point = np.tile(crossings.point, (2, 1))
-    kept = (edge_face >= 0) & (np.isin(face, large) | np.isin(edge_face, large))
-    pair = np.minimum(face, edge_face) * len(sheets.region) + np.maximum(face, edge_face)
-    order = np.flatnonzero(kept)[np.argsort(pair[kept], kind="stable")]
-    pair, point = pair[order], point[order]
-    # Two triangles cross along one segment; where degeneracy leaves a single point, mark that.
-    begins = np.flatnonzero(np.concatenate([[True], pair[1:] != pair[:-1]])[: len(pair)])
-    ends = np.concatenate([begins[1:], [len(pair)]])[: len(begins)] - 1
-    return point[begins], point[ends]

@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.boundary import area_normals, summed
-from spt_jax.overlap.triangles.sheets import Sheets, shared_corners
+from spt_jax.overlap.triangles.segments import Cusps, crossed_triangles, find_segments
+from spt_jax.overlap.triangles.sheets import Sheets
 
 # What the sums with constants, of sides of length one, may leave.
 _GAP = 1e-6
@@ -34,12 +35,6 @@ _CLOSED = 1e-6
 
 # Regions compared with all others together.
 _AT_ONCE = 64
-
-# More segments than this on one triangle are not compared with each other; rays take over.
-_MOST_SEGMENTS = 2000
-
-# Segments that meet within this part of their lengths from an end do not cross there.
-_AT_END = 1e-6
 
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # (u, v) of a triangle's corners
 
@@ -68,22 +63,23 @@ def solve(
     row[found] = np.arange(len(found))
     normals = area_normals(vertices, corners)
 
-    segments = _segments(vertices, faces, sheets)
+    segments = find_segments(vertices, faces, sheets)
     # Each segment is a jump on both of its triangles.
-    own, foreign = segments.pair.ravel(), segments.pair[:, ::-1].ravel()
-    start, end = (np.repeat(x, 2, axis=0) for x in (segments.start, segments.end))
+    whole = segments.only(segments.whole)
+    own, foreign = whole.pair.ravel(), whole.pair[:, ::-1].ravel()
+    start, end = (np.repeat(x, 2, axis=0) for x in (whole.start, whole.end))
     # On the left of the segment, seen against the own normal, is the foreign solid's inside?
     left = np.cross(normals[row[own]], end - start)
     jump = -np.sign(np.einsum("ki,ki->k", left, normals[row[foreign]]))
-    cusps = segments.cusps(faces, row, own, jump)
+    cusps = whole.cusps(faces, row, own, jump)
     sums, sound, deep = _sides(vertices, faces, sheets, row, cusps)
     start, end = (
         _coordinates(vertices, corners[row[own]], normals[row[own]], x) for x in (start, end)
     )
     np.add.at(sums, row[own], jump[:, None] * _along(start, end))
-    deep |= _crossed(row[own], start, end, len(found))
+    deep |= crossed_triangles(row[own], start, end, len(found))
     sound &= (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
-    sound[row[segments.unmatched]] = False
+    sound[row[segments.pair[~segments.whole]]] = False
 
     share = sums[:, :3]
     region = sheets.region[found]
@@ -177,32 +173,7 @@ def _along(start, end) -> Float[np.ndarray, "K 5"]:
     return np.concatenate([integrals, step], axis=1)
 
 
-def _crossed(row, start, end, count: int) -> Bool[np.ndarray, "H"]:
-    """Triangles on which two segments cross: three parts meet there, and may lie in one place."""
-    order = np.argsort(row, kind="stable")
-    row, start, end = row[order], start[order], end[order]
-    number = np.bincount(row, minlength=count)
-    crossed = number > _MOST_SEGMENTS
-    # Each segment against those after it on the same triangle.
-    last = np.cumsum(number)[row]
-    later = np.where(crossed[row], 0, last - np.arange(len(row)) - 1)
-    first = np.repeat(np.arange(len(row)), later)
-    second = np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later) + first + 1
-
-    def cuts(a, b, c, d):
-        # Whether the line through a and b passes between c and d; not at an end, where the
-        # segments of neighbouring triangles meet.
-        u, v = b - a, np.stack([c - a, d - a])
-        turn = u[:, 0] * v[..., 1] - u[:, 1] * v[..., 0]
-        width = np.abs(turn[0] - turn[1])
-        return (turn[0] * turn[1] < 0) & (np.abs(turn).min(axis=0) > _AT_END * width)
-
-    one, other = (start[first], end[first]), (start[second], end[second])
-    crossed[row[first[cuts(*one, *other) & cuts(*other, *one)]]] = True
-    return crossed
-
-
-def _sides(vertices, faces, sheets: Sheets, row, cusps: "_Cusps"):
+def _sides(vertices, faces, sheets: Sheets, row, cusps: Cusps):
     """The sides' part of all sums; where they are known; which triangles lie deeper than w = 1."""
     corners = faces[sheets.faces]
     count = len(corners)
@@ -246,7 +217,7 @@ def _sides(vertices, faces, sheets: Sheets, row, cusps: "_Cusps"):
     return sums, known.reshape(count, 3).all(axis=1), deep
 
 
-def _at_starts(start, end, total_jump, sheets: Sheets, cusps: "_Cusps"):
+def _at_starts(start, end, total_jump, sheets: Sheets, cusps: Cusps):
     """The winding number on the outer side at the start of each side, and where it is known.
 
     It is the corner's, or that of the side's other end without the jumps between. At a cusp a
@@ -283,61 +254,3 @@ def _ask_neighbours(start, end, begins, total_jump, known) -> None:
     # A neighbour that is in no overlap is not among the sides: nothing overlaps along the edge.
     begins[lost] = np.where(there, begins[twin] + total_jump[twin], 0.0)
     known[lost] = ~there | known[twin]
-
-
-@dataclass(frozen=True)
-class _Segments:
-    """Where pairs of triangles cross; `unmatched` triangles have a pair without two ends.
-
-    Where two crossing triangles share a vertex, their segment starts there: `cusp` names it, and is
-    -1 elsewhere.
-    """
-
-    pair: Int[np.ndarray, "K 2"]
-    start: Float[np.ndarray, "K 3"]
-    end: Float[np.ndarray, "K 3"]
-    cusp: Int[np.ndarray, "K"]
-    unmatched: Int[np.ndarray, "U"]
-
-    def cusps(self, faces, row, own, jump) -> "_Cusps":
-        """What the segments that start at shared vertices do to their triangles' corners."""
-        cusp = np.repeat(self.cusp, 2)
-        at = np.flatnonzero(cusp >= 0)
-        corner = np.argmax(faces[own[at]] == cusp[at, None], axis=1)
-        total = np.zeros(3 * (row.max(initial=-1) + 1))
-        np.add.at(total, 3 * row[own[at]] + corner, jump[at])
-        return _Cusps(np.unique(cusp[at]), total)
-
-
-@dataclass(frozen=True)
-class _Cusps:
-    """Vertices where the surface touches itself, so that the winding number around is not one.
-
-    `jump` is how much it changes from a triangle's side that starts at such a corner to the one
-    that ends there, over the segments between them.
-    """
-
-    vertices: Int[np.ndarray, "C"]
-    jump: Float[np.ndarray, "S"]
-
-
-def _segments(vertices, faces, sheets: Sheets) -> _Segments:
-    crossings, count = sheets.crossings, len(faces)
-    edge_face = crossings.edge_faces.T.ravel()
-    other = np.tile(crossings.face, 2)
-    point = np.tile(crossings.point, (2, 1))
-    kept = edge_face >= 0
-    low, high = np.minimum(edge_face, other)[kept], np.maximum(edge_face, other)[kept]
-    point = point[kept]
-    # A vertex that the two triangles share is an end of their segment, and is put first.
-    shared_by, shared = shared_corners(faces, sheets.pairs)
-    key = np.concatenate([sheets.pairs[shared_by] @ np.array([count, 1]), low * count + high])
-    point = np.concatenate([vertices[shared], point])
-    cusp = np.concatenate([shared, np.full(len(low), -1)])
-    order = np.argsort(key, kind="stable")
-    key, point, cusp = key[order], point[order], cusp[order]
-    begin = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]])[: len(key)])
-    two = np.diff(np.append(begin, len(key))) == 2
-    pair = np.stack(np.divmod(key[begin], count), axis=1)
-    begin, unmatched = begin[two], pair[~two].ravel()
-    return _Segments(pair[two], point[begin], point[begin + 1], cusp[begin], unmatched)
