@@ -10,7 +10,7 @@ import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap
-from spt_jax.fit.untangle_mesh import untangle_mesh
+from spt_jax.untangle.mesh import untangle_mesh
 
 
 @dataclass

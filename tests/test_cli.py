@@ -14,10 +14,10 @@ import trimesh
 from helpers_body import synthetic_smpl
 
 from spt_jax.body import load_mocap
+from spt_jax.body.pose_files import read_poses, write_poses
 from spt_jax.cli import main
 from spt_jax.commands.demo import DEMO_FRAMES
 from spt_jax.commands.untangle import select_frames
-from spt_jax.fit.pose_files import read_poses, write_poses
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def calls(monkeypatch):
 
 
 def replace_untangle_pose(monkeypatch, function):
-    monkeypatch.setattr("spt_jax.fit.untangle.untangle_pose", function)
+    monkeypatch.setattr("spt_jax.untangle.pose.untangle_pose", function)
 
 
 def files_in(folder):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from spt_jax.fit.pose_files import JOINT_COUNTS, read_poses, write_poses
+from spt_jax.body.pose_files import JOINT_COUNTS, read_poses, write_poses
 
 
 def save(path, **arrays):

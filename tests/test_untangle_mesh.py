@@ -19,11 +19,11 @@ from helpers import (
 )
 
 from spt_jax.cli import main
-from spt_jax.fit.contours import contour_forces
-from spt_jax.fit.spread import Spread, Surface
-from spt_jax.fit.untangle_mesh import untangle_mesh
 from spt_jax.mesh_files import read_mesh
 from spt_jax.overlap.triangles.pairs import edge_crossings
+from spt_jax.untangle.contours import contour_forces
+from spt_jax.untangle.mesh import untangle_mesh
+from spt_jax.untangle.spread import Spread, Surface
 
 
 def intersects(vertices, faces) -> bool:
@@ -211,7 +211,7 @@ def test_a_mesh_file_is_freed_in_its_own_format(suffix, tmp_path, capsys):
 def test_a_mesh_file_that_does_not_come_free_says_so(tmp_path, capsys, monkeypatch):
     import trimesh
 
-    from spt_jax.fit import untangle_mesh as module
+    from spt_jax.untangle import untangle_mesh as module
 
     def hasty(*mesh, **options):
         return untangle_mesh(*mesh, **{**options, "attempts": 1, "steps_per_attempt": 1})

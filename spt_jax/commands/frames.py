@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spt_jax.body import BodyModel
-    from spt_jax.fit.untangle import Folds
     from spt_jax.report import IntersectionReport
+    from spt_jax.untangle.pose import Folds
 
 _CUBIC_CENTIMETRES = 1e6  # in a cubic metre
 
@@ -62,8 +62,8 @@ def untangle_frames(
     state: State,
 ) -> list[Frame]:
     """Report on each frame, untangle it, and report again; folds that stay are not reported."""
-    from spt_jax.fit.untangle import untangle_pose
     from spt_jax.report import intersection_report
+    from spt_jax.untangle.pose import untangle_pose
 
     rest = body.rest_surface if folds == "ignore" else None
     asked = {"rays": rays, "directions": directions, "folds": rest}
@@ -196,7 +196,7 @@ def write_meshes(
 
 def write_motion(path: Path, frames: Sequence[Frame], motion: Motion) -> None:
     """Write the untangled poses, with the shapes and translations that came with them."""
-    from spt_jax.fit.pose_files import write_poses
+    from spt_jax.body.pose_files import write_poses
 
     write_poses(
         path,

@@ -13,7 +13,7 @@ from spt_jax.commands.terminal import err_console, out_console, progress_bar, sh
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from spt_jax.fit.untangle_mesh import UntangleMeshResult
+    from spt_jax.untangle.mesh import UntangleMeshResult
 
 # Text formats keep every digit; the others hold float32, so the mesh must be free in float32.
 _TEXT = (".obj", ".off")
@@ -43,7 +43,7 @@ def untangle_mesh_file(
     given = vertices if suffix in _TEXT else vertices.astype(np.float32)
     start = time.perf_counter()
     with progress_bar(1, quiet) as state:
-        from spt_jax.fit.untangle_mesh import untangle_mesh
+        from spt_jax.untangle.mesh import untangle_mesh
 
         def on_step(attempt: int, steps: int, crossings: int) -> None:
             state(f"{path.name}: attempt {attempt + 1}, step {steps}, {crossings} crossings")

@@ -14,8 +14,8 @@ from spt_jax.commands.terminal import err_console, out_console, progress_bar, sh
 
 if TYPE_CHECKING:
     from spt_jax.body import BodyModel
+    from spt_jax.body.pose_files import PoseFile
     from spt_jax.commands.frames import Motion
-    from spt_jax.fit.pose_files import PoseFile
 
 
 def untangle(
@@ -57,7 +57,7 @@ def untangle(
             _refuse_for_mesh(frames=frames != "all", body=body != "anny", folds=folds != "ignore")
         return untangle_mesh_file(poses, out, meshes=meshes, rays=rays, json=json, quiet=quiet)
     from spt_jax.arguments import as_rays
-    from spt_jax.fit.pose_files import read_poses
+    from spt_jax.body.pose_files import read_poses
     from spt_jax.output_files import ensure_folder, write_json
 
     with user_errors():

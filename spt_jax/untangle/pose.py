@@ -13,8 +13,6 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
-from spt_jax.fit.spread import Surface
-from spt_jax.fit.untangle_mesh import SEARCH_RAYS, untangle_checked
 from spt_jax.geometry import inflate
 from spt_jax.host import parallel_map
 from spt_jax.overlap.exclusions import Exclusions
@@ -22,6 +20,8 @@ from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.penalty import self_intersection_penalty
 from spt_jax.rest_surface import RestSurface
+from spt_jax.untangle.mesh import SEARCH_RAYS, untangle_checked
+from spt_jax.untangle.spread import Surface
 
 Folds = Literal["ignore", "remove", "count"]
 

@@ -9,12 +9,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from spt_jax.arguments import as_directions, as_rays
-from spt_jax.fit.freeing import free_vertices
-from spt_jax.fit.spread import Surface
 from spt_jax.host import parallel_map
 from spt_jax.mesh_check import check_mesh, one_mesh
 from spt_jax.overlap.measure import Directions, Sampling, measure
 from spt_jax.overlap.triangles.pairs import edge_crossings
+from spt_jax.untangle.freeing import free_vertices
+from spt_jax.untangle.spread import Surface
 
 # The search needs no more: the last crossings go by their contours, which no ray has to see.
 SEARCH_RAYS = 256

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.fit.contours import contour_forces
-from spt_jax.fit.spread import Spread, Surface
 from spt_jax.host import parallel_map
 from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.overlap.triangles.pairs import EdgeCrossings, edge_crossings
+from spt_jax.untangle.contours import contour_forces
+from spt_jax.untangle.spread import Spread, Surface
 
 # How far a push spreads, in edges, by the root of the number of vertices in the overlap: wide
 # enough that the middle of a deep overlap and its rim move together. Of 0.17, 0.25 and 0.5, the

@@ -1,1 +1,0 @@
-"""Fitting: objectives and solvers that use the penalty."""

@@ -1,0 +1,1 @@
+"""Freeing bodies and meshes of their self-intersections."""
