@@ -1,0 +1,1 @@
+"""Poses from keypoints: what a fit minimises, and the fit."""
