@@ -243,3 +243,38 @@ def test_poses_of_no_known_layout_are_refused(rng, untyped):
         body.pose_from_smpl(jnp.zeros((21, 3)))
     with pytest.raises(TypeError, match="floating-point"):
         body.pose_from_smpl(jnp.zeros((22, 3), jnp.int32))
+
+
+@pytest.mark.parametrize("indices", [[41, 0, 0, 7], []])
+def test_a_few_vertices_are_those_of_the_whole_body(rng, indices):
+    body = _model(synthetic_smpl(rng))
+    pose = jnp.asarray(smpl_pose(rng, 24)[0], "float32")
+    shape = jnp.asarray(rng.normal(size=10), "float32")
+    few = body.at_vertices(indices)
+    assert few.num_vertices == len(indices) and few.faces.shape == (0, 3)
+    whole, part = _posed(body, pose, shape), _posed(few, pose, shape)
+    rows = np.array(indices, int)
+    np.testing.assert_allclose(part.vertices, whole.vertices[rows], atol=1e-5)
+    np.testing.assert_allclose(part.joints, whole.joints, atol=1e-5)
+
+
+def test_a_few_vertices_of_a_traced_body_pass_on_its_gradient(rng):
+    body = _model(synthetic_smpl(rng))
+    slope = eqx.filter_grad(lambda b: jnp.sum(b.at_vertices([5, 9]).template[1]))(body)
+    np.testing.assert_array_equal(slope.template, np.eye(60)[9][:, None] * np.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("indices", "error", "message"),
+    [
+        ([60], ValueError, "from 0 to 59, one for each vertex: got 60"),
+        ([2, -1], ValueError, "got -1"),
+        ([1.0], TypeError, "whole numbers"),
+        ([[1, 2]], ValueError, r"shape \(1, 2\)"),
+        (3, ValueError, r"shape \(\)"),
+    ],
+)
+def test_impossible_vertices_are_named(rng, indices, error, message):
+    body = _model(synthetic_smpl(rng))
+    with pytest.raises(error, match=message):
+        body.at_vertices(indices)

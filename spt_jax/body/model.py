@@ -1,12 +1,13 @@
 """The body model: shape and pose in, vertices and joints out."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float, Int
 
 from spt_jax.groups import Pairs, neighbour_pairs, part_groups
@@ -251,6 +252,57 @@ class BodyModel(eqx.Module):
             (8, 52, 3)
         """
         return poses.pose_from_smpl(pose, self.joint_names)
+
+    def at_vertices(self, indices: Any) -> "BodyModel":
+        """The same body with some of its vertices only, and no faces.
+
+        A few landmarks are then posed at the cost of a few vertices: joints, shape and pose mean
+        what they did, and vertex k of the result is vertex `indices[k]` of this body.
+
+        Args:
+            indices: of the vertices to keep, in any order; they may repeat, and may be none.
+
+        Returns:
+            A BodyModel with `len(indices)` vertices.
+
+        Raises:
+            TypeError: indices that are not whole numbers, or are traced.
+            ValueError: indices that are no list, or out of range.
+        Differentiation: every mode, with respect to the model's arrays.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from spt_jax.body import load_body
+            >>> tip = load_body().at_vertices([7])
+            >>> tip(jnp.zeros((52, 3))).vertices.shape
+            (1, 3)
+        """
+        if isinstance(indices, Tracer):
+            raise TypeError("indices must be known when traced: got a traced array.")
+        rows = np.asarray(indices)
+        if rows.size == 0:
+            rows = rows.astype(np.int32)
+        if not np.issubdtype(rows.dtype, np.integer):
+            raise TypeError(f"indices must be whole numbers: got dtype {rows.dtype}.")
+        if rows.ndim != 1:
+            raise ValueError(f"indices must be a list of vertices: got shape {rows.shape}.")
+        if rows.size and (rows.min() < 0 or rows.max() >= self.num_vertices):
+            worst = int(rows.min() if rows.min() < 0 else rows.max())
+            raise ValueError(
+                f"indices must be from 0 to {self.num_vertices - 1}, one for each vertex: got "
+                f"{worst}; indices are 0-based."
+            )
+        return BodyModel(
+            template=self.template[rows],
+            shape_basis=self.shape_basis[rows],
+            joint_template=self.joint_template,
+            joint_shape_basis=self.joint_shape_basis,
+            weights=self.weights[rows],
+            faces=jnp.zeros((0, 3), jnp.int32),
+            parents=self.parents,
+            joint_names=self.joint_names,
+            pose_basis=None if self.pose_basis is None else self.pose_basis[rows],
+        )
 
     def _coefficients(self, shape, dtype: DTypeLike | None) -> Float[Array, "*batch B"]:
         betas = _floating("shape", shape)
