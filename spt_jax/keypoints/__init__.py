@@ -1,0 +1,9 @@
+"""Keypoints: their layouts, their places on a body, and files of them."""
+
+from .landmarks import find_landmarks as find_landmarks
+from .layouts import LAYOUTS as LAYOUTS
+from .layouts import Layout as Layout
+from .layouts import as_layout as as_layout
+from .layouts import edge_side as edge_side
+from .regressor import KeypointRegressor as KeypointRegressor
+from .regressor import keypoint_regressor as keypoint_regressor

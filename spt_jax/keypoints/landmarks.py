@@ -1,0 +1,143 @@
+"""Vertices of the face, the ears and the feet, where keypoints lie that no joint gives."""
+
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Float
+
+from spt_jax.body import BodyModel
+
+#: The landmarks that every body has.
+LANDMARKS = (
+    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "head_top"),
+    *("left_big_toe", "left_small_toe", "left_heel"),
+    *("right_big_toe", "right_small_toe", "right_heel"),
+)
+
+# By number of vertices; as in https://github.com/vchoutas/smplx, smplx/vertex_ids.py.
+_OFFICIAL = {
+    6890: {  # SMPL and SMPL-H
+        **{"nose": 332, "left_eye": 2800, "right_eye": 6260, "left_ear": 583, "right_ear": 4071},
+        **{"left_big_toe": 3216, "left_small_toe": 3226, "left_heel": 3387},
+        **{"right_big_toe": 6617, "right_small_toe": 6624, "right_heel": 6787},
+    },
+    10475: {  # SMPL-X
+        **{"nose": 9120, "left_eye": 9448, "right_eye": 9929, "left_ear": 6, "right_ear": 616},
+        **{"left_big_toe": 5770, "left_small_toe": 5780, "left_heel": 8846},
+        **{"right_big_toe": 8463, "right_small_toe": 8474, "right_heel": 8635},
+    },
+}
+
+# Heights above the tip of the nose, per distance from there to the top of the head, and the eyes'
+# distance from the middle per half of the head's width over the ears. On the embedded body the
+# eyes' middles are at 0.24 and 0.34; people's are 63 mm apart on a width of 185 mm.
+_EYE_HEIGHT, _EYE_SIDE, _EAR_HEIGHT = 0.24, 0.34, 0.12
+
+
+def find_landmarks(body: BodyModel) -> dict[str, int]:
+    """The vertex of each landmark of a body.
+
+    SMPL, SMPL-H and SMPL-X, known by their 6,890 and 10,475 vertices, have official ones, but for
+    the top of the head. On any other body, and for that, they are found on the rest surface, which
+    stands upright along y, faces z and has its left at +x, among the vertices that the head or a
+    foot moves:
+
+        nose                the foremost of the head near its mid-plane
+        head_top            the highest of the head near its mid-plane
+        eyes, ears          the nearest, seen from the front, to fixed proportions of nose, top and
+                            width: half-way up the face, and outermost at the nose's bridge
+        big toes            the foremost of the foot
+        small toes          the foremost of the foot's outer border
+        heels               the hindmost of the foot near the ground
+
+    Args:
+        body: the body; its template and skinning weights are read.
+
+    Returns:
+        A vertex index for each of LANDMARKS.
+
+    Raises:
+        TypeError: inside jit, grad or vmap of a function that the body is an argument of.
+        ValueError: the body has no joint, or no vertices, for a head or a foot.
+
+    Example:
+        >>> from spt_jax.body import load_body
+        >>> from spt_jax.keypoints.landmarks import find_landmarks
+        >>> body = load_body()
+        >>> found = find_landmarks(body)
+        >>> bool(body.template[found["left_eye"], 0] > body.template[found["nose"], 0])
+        True
+    """
+    if isinstance(body.template, Tracer) or isinstance(body.weights, Tracer):
+        raise TypeError(
+            "body must be known: got a traced body; find its landmarks, or make its keypoint "
+            "regressor, outside jit, grad and vmap."
+        )
+    vertices = np.asarray(body.template, np.float64)
+    found = _of_the_head(body, vertices)
+    for side, outward in (("left", 1.0), ("right", -1.0)):
+        found |= _of_the_foot(body, vertices, side, outward)
+    found |= _OFFICIAL.get(len(vertices), {})
+    return {name: found[name] for name in LANDMARKS}
+
+
+def _of_the_head(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> dict[str, int]:
+    rows = _moved_by(body, ("head", "jaw", "left_eye", "right_eye"), "head")
+    head = vertices[rows]
+    low, high = head.min(axis=0), head.max(axis=0)
+    middle, half = (low[0] + high[0]) / 2, (high[0] - low[0]) / 2
+    # Of a coarse mesh at least the vertex nearest to the mid-plane.
+    aside = np.abs(head[:, 0] - middle)
+    central = aside <= max(0.1 * half, aside.min())
+    nose = _best(head[:, 2], central)
+    top = _best(head[:, 1], central)
+    rise = head[top, 1] - head[nose, 1]
+    found = {"nose": nose, "head_top": top}
+    for side, outward in (("left", half), ("right", -half)):
+        eye = middle + _EYE_SIDE * outward, head[nose, 1] + _EYE_HEIGHT * rise
+        ear = middle + outward, head[nose, 1] + _EAR_HEIGHT * rise
+        away = np.linalg.norm(head[:, :2] - eye, axis=1)
+        # Behind an eye lie its socket (the embedded body's are hollow, 3 cm deep) and the back of
+        # the head: what counts is within a twentieth of the head's depth of the foremost there.
+        around = away <= max(0.12 * abs(outward), away.min())
+        front = head[:, 2] >= head[around, 2].max() - 0.05 * (high[2] - low[2])
+        found[f"{side}_eye"] = _best(-away, around & front)
+        found[f"{side}_ear"] = _best(-np.linalg.norm(head[:, :2] - ear, axis=1))
+    return {name: int(rows[k]) for name, k in found.items()}
+
+
+def _of_the_foot(
+    body: BodyModel, vertices: Float[np.ndarray, "V 3"], side: str, outward: float
+) -> dict[str, int]:
+    rows = _moved_by(body, (f"{side}_ankle", f"{side}_foot"), f"{side}_ankle")
+    foot = vertices[rows]
+    low, high = foot.min(axis=0), foot.max(axis=0)
+    across = outward * foot[:, 0]
+    width = across.max() - across.min()
+    sole = foot[:, 1] <= low[1] + 0.3 * (high[1] - low[1])
+    found = {
+        "big_toe": _best(foot[:, 2]),
+        "small_toe": _best(foot[:, 2], across >= across.max() - 0.15 * width),
+        "heel": _best(-foot[:, 2], sole),
+    }
+    return {f"{side}_{name}": int(rows[k]) for name, k in found.items()}
+
+
+def _moved_by(body: BodyModel, joints: tuple[str, ...], needed: str) -> np.ndarray:
+    """The vertices that these joints move for more than a half."""
+    if needed not in body.joint_names:
+        raise ValueError(
+            f"body must have a joint {needed!r} for its landmarks to be found: got "
+            f"{', '.join(body.joint_names)}; name keypoints that are joints of the body."
+        )
+    columns = [k for k, name in enumerate(body.joint_names) if name in joints]
+    rows = np.flatnonzero(np.asarray(body.weights)[:, columns].sum(axis=1) > 0.5)
+    if rows.size == 0:
+        raise ValueError(
+            f"body must have vertices that {' and '.join(joints)} move for more than a half: got "
+            "none; its landmarks cannot be found. Name keypoints that are joints of the body."
+        )
+    return rows
+
+
+def _best(score: np.ndarray, allowed: np.ndarray | None = None) -> int:
+    return int(np.argmax(score if allowed is None else np.where(allowed, score, -np.inf)))

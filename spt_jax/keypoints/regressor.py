@@ -1,0 +1,360 @@
+"""Keypoints of a body: a fixed linear map from its joints and a few of its vertices."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from spt_jax.body import BodyModel, PosedBody
+
+from .landmarks import LANDMARKS, find_landmarks
+from .layouts import as_layout
+from .points import COMBINATIONS, needs_landmarks, weights_of
+
+
+class KeypointRegressor(eqx.Module):
+    """Keypoints as weighted sums of a body's joints and of some of its vertices.
+
+        keypoints = joint_weights joints + vertex_weights vertices[list(regressor.vertices)]
+
+    Get one from `keypoint_regressor`. Where only keypoints are wanted, pose
+    `body.at_vertices(regressor.vertices)`: its vertices are the `landmarks` of a call.
+
+    Attributes:
+        names: one a keypoint, in the vocabulary of `spt_jax.keypoints.layouts.Layout`, so that
+            "left_hip" or "nose" can be found whatever the layout. Static.
+        vertices: the vertices of the body that are used. Static.
+        joint_weights: of each joint in each keypoint.
+        vertex_weights: of each of `vertices` in each keypoint.
+
+    Raises:
+        TypeError: weights that are not floating-point.
+        ValueError: shapes disagree.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax.body import load_body
+        >>> from spt_jax.keypoints import keypoint_regressor
+        >>> body = load_body()
+        >>> regressor = keypoint_regressor(body, "coco17")
+        >>> posed = body.at_vertices(regressor.vertices)(jnp.zeros((52, 3)))
+        >>> regressor(posed.joints, posed.vertices).shape
+        (17, 3)
+        >>> regressor.names[5]
+        'left_shoulder'
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    vertices: tuple[int, ...] = eqx.field(static=True)
+    joint_weights: Float[Array, "K J"]
+    vertex_weights: Float[Array, "K L"]
+
+    def __check_init__(self):
+        counts = {"joint_weights": None, "vertex_weights": len(self.vertices)}
+        for name, columns in counts.items():
+            array = getattr(self, name)
+            if not jnp.issubdtype(array.dtype, jnp.floating):
+                raise TypeError(f"{name} must be floating-point: got dtype {array.dtype}.")
+            fits = array.ndim == 2 and array.shape[0] == len(self.names)
+            if not fits or columns not in (None, array.shape[1]):
+                wanted = "joints" if columns is None else columns
+                raise ValueError(
+                    f"{name} must have shape ({len(self.names)}, {wanted}), a row a name: got "
+                    f"{array.shape}."
+                )
+
+    def __call__(
+        self,
+        joints: Float[Array | np.ndarray, "*batch J 3"],
+        landmarks: Float[Array | np.ndarray, "*batch L 3"],
+    ) -> Float[Array, "*batch K 3"]:
+        """The keypoints of a posed body.
+
+        Args:
+            joints: the body's joints; any number of leading batch axes.
+            landmarks: its vertices `self.vertices`, in that order.
+
+        Returns:
+            A row for each of `names`, in the unit and dtype of `joints`.
+
+        Raises:
+            TypeError, ValueError: not floating-point, or as many joints or landmarks as the
+                weights have columns.
+        Differentiation: every mode; the map is linear.
+
+        Example:
+            See the class.
+        """
+        total = None
+        for name, points, weights in (
+            ("joints", joints, self.joint_weights),
+            ("landmarks", landmarks, self.vertex_weights),
+        ):
+            array = jnp.asarray(points)
+            if not jnp.issubdtype(array.dtype, jnp.floating):
+                raise TypeError(f"{name} must be floating-point: got dtype {array.dtype}.")
+            count = weights.shape[-1]
+            if array.ndim < 2 or array.shape[-2:] != (count, 3):
+                raise ValueError(
+                    f"{name} must be (..., {count}, 3): got shape {tuple(array.shape)}; joints are "
+                    "all of the body's, landmarks its vertices of regressor.vertices."
+                )
+            dtype = array.dtype if total is None else total.dtype
+            part = jnp.einsum(
+                "kp,...pc->...kc",
+                weights.astype(dtype),
+                array.astype(dtype),
+                precision=jax.lax.Precision.HIGHEST,
+            )
+            total = part if total is None else total + part
+        return total
+
+    def of(self, posed: PosedBody) -> Float[Array, "*batch K 3"]:
+        """The keypoints of a whole posed body, all of its vertices given.
+
+        Args:
+            posed: what the body that the regressor was made for returns.
+
+        Returns, Raises, Differentiation: as a call.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from spt_jax.body import load_body
+            >>> from spt_jax.keypoints import keypoint_regressor
+            >>> body = load_body()
+            >>> keypoint_regressor(body, "body25").of(body(jnp.zeros((52, 3)))).shape
+            (25, 3)
+        """
+        rows = np.array(self.vertices, np.int32)
+        return self(posed.joints, posed.vertices[..., rows, :])
+
+    def find(self, *names: str) -> tuple[int, ...] | None:
+        """The rows of keypoints by name, or None where one of them is missing.
+
+        Example:
+            >>> from spt_jax.body import load_body
+            >>> from spt_jax.keypoints import keypoint_regressor
+            >>> regressor = keypoint_regressor(load_body(), "h36m17")
+            >>> regressor.find("left_hip", "right_hip"), regressor.find("left_heel")
+            ((4, 1), None)
+        """
+        missing = any(name not in self.names for name in names)
+        return None if missing else tuple(self.names.index(name) for name in names)
+
+
+def keypoint_regressor(
+    body: BodyModel,
+    joints: Any,
+    *,
+    count: int | None = None,
+    names: str | Sequence[str] | None = None,
+) -> KeypointRegressor:
+    """The map from a body's joints and vertices to keypoints in the order that a user has them.
+
+    Joints of a layout are the body's of the same name, faces and feet vertices
+    (`spt_jax.keypoints.landmarks`), and what lies between is in COMBINATIONS: the neck of
+    BODY_25 and the thorax of H36M-17 half-way between the shoulders, the middle of the hips, the
+    hips of COCO-17, BODY_25 and H36M-17 farther out than SMPL's joints, H36M-17's spine half-way
+    up the back and its "Neck/Nose" half-way between the head joint and the nose.
+
+    Args:
+        body: the body; for landmarks its template and weights are read.
+        joints: one of
+
+            - "coco17", "body25", "openpose18", "h36m17", "smpl22", "smpl24", "smpl52", "smpl55",
+              or "smpl" with a `count`;
+            - a sequence of names: joints of the body, landmarks, or COMBINATIONS;
+            - a sequence of whole numbers: joints of the body;
+            - a dense regressor as SMPL's users have them: (K, V) from the vertices, of which those
+              with a weight are kept, or (K, J) from the joints; NumPy, JAX or SciPy sparse. Its
+              rows sum to 1;
+            - a KeypointRegressor, which comes back as it is.
+        count: how many keypoints there are, to be checked against `joints`; None leaves that out.
+        names: names for the rows of a dense regressor: a layout's name or a sequence. By None they
+            are "point0", "point1" and so on, and nothing is known about them.
+
+    Returns:
+        A KeypointRegressor, in the dtype of the body.
+
+    Raises:
+        TypeError: `joints` is none of these; the body, or a dense regressor, is traced.
+        ValueError: an unknown layout; a keypoint that this body lacks; an index out of range; a
+            dense regressor that does not fit the body, is not finite or whose rows do not sum to 1;
+            another count than `count`.
+
+    Example:
+        >>> from spt_jax.body import load_body
+        >>> from spt_jax.keypoints import keypoint_regressor
+        >>> regressor = keypoint_regressor(load_body(), ["left_wrist", "nose"])
+        >>> regressor.names, len(regressor.vertices)
+        (('left_wrist', 'nose'), 1)
+    """
+    if isinstance(joints, KeypointRegressor):
+        made = joints
+        if made.joint_weights.shape[-1] != body.num_joints or any(
+            vertex >= body.num_vertices for vertex in made.vertices
+        ):
+            raise ValueError(
+                f"joints must be a regressor for this body, {body.num_joints} joints and "
+                f"{body.num_vertices} vertices: got one for {made.joint_weights.shape[-1]} joints "
+                f"and vertices up to {max(made.vertices, default=0)}; make it anew for this body."
+            )
+    elif isinstance(joints, str):
+        layout = as_layout(joints, count)
+        surface = not layout.name.startswith("smpl")
+        made = _from_names(body, layout.names, layout.points, layout.name, surface=surface)
+    elif _is_sequence_of(joints, str):
+        made = _from_names(body, tuple(joints), tuple(joints), "joints", surface=False)
+    elif _is_sequence_of(joints, (int, np.integer)) or _is_row_of_indices(joints):
+        made = _from_indices(body, [int(index) for index in joints])
+    else:
+        made = _from_dense(body, joints, names)
+        names = None
+    if names is not None:
+        raise ValueError(
+            "names must be left out where joints is no dense regressor: its keypoints have names, "
+            f"{', '.join(made.names[:3])}, ..."
+        )
+    if count is not None and count != len(made.names):
+        raise ValueError(
+            f"joints must give as many keypoints as there are: got {len(made.names)} for {count} "
+            "keypoints."
+        )
+    return made
+
+
+def _is_sequence_of(value: Any, kind: Any) -> bool:
+    return (
+        isinstance(value, (list, tuple))
+        and len(value) > 0
+        and all(isinstance(entry, kind) and not isinstance(entry, bool) for entry in value)
+    )
+
+
+def _is_row_of_indices(value: Any) -> bool:
+    if isinstance(value, Tracer) or not isinstance(value, (np.ndarray, Array)):
+        return False
+    return value.ndim == 1 and bool(np.issubdtype(value.dtype, np.integer)) and value.size > 0
+
+
+def _from_indices(body: BodyModel, indices: list[int]) -> KeypointRegressor:
+    for index in indices:
+        if not 0 <= index < body.num_joints:
+            raise ValueError(
+                f"joints must be from 0 to {body.num_joints - 1}, the body's joints: got {index}; "
+                "indices are 0-based."
+            )
+    rows = [{body.joint_names[index]: 1.0} for index in indices]
+    return _assemble(body, tuple(body.joint_names[index] for index in indices), rows, {})
+
+
+def _from_names(
+    body: BodyModel, names: tuple[str, ...], points: tuple[str, ...], what: str, *, surface: bool
+) -> KeypointRegressor:
+    """`surface`: "left_eye" is the vertex also where the body, SMPL-X, has a joint of that name."""
+    own = set(body.joint_names)
+    landmarks = find_landmarks(body) if needs_landmarks(points, own, surface) else {}
+    if not surface:
+        landmarks = {name: vertex for name, vertex in landmarks.items() if name not in own}
+    rows = [weights_of(body, point) for point in points]
+    missing = [
+        name
+        for name, row in zip(names, rows, strict=True)
+        if not all(source in own or source in landmarks for source in row)
+    ]
+    if missing:
+        raise ValueError(
+            f"{what} must be keypoints of the body: it lacks {', '.join(missing[:5])}"
+            f"{' and more' if len(missing) > 5 else ''}; it has the joints "
+            f"{', '.join(body.joint_names)}, and all have {', '.join((*LANDMARKS, *COMBINATIONS))}."
+            " List those that you have."
+        )
+    return _assemble(body, names, rows, landmarks)
+
+
+def _assemble(
+    body: BodyModel,
+    names: tuple[str, ...],
+    rows: list[dict[str, float]],
+    landmarks: dict[str, int],
+) -> KeypointRegressor:
+    joints = {name: k for k, name in enumerate(body.joint_names) if name not in landmarks}
+    used = sorted({source for row in rows for source in row if source not in joints})
+    columns = {name: k for k, name in enumerate(used)}
+    joint_weights = np.zeros((len(names), body.num_joints))
+    vertex_weights = np.zeros((len(names), len(used)))
+    for k, row in enumerate(rows):
+        for source, weight in row.items():
+            if source in joints:
+                joint_weights[k, joints[source]] += weight
+            else:
+                vertex_weights[k, columns[source]] += weight
+    dtype = body.template.dtype
+    return KeypointRegressor(
+        names,
+        tuple(landmarks[name] for name in used),
+        jnp.asarray(joint_weights, dtype),
+        jnp.asarray(vertex_weights, dtype),
+    )
+
+
+def _from_dense(
+    body: BodyModel, joints: Any, names: str | Sequence[str] | None
+) -> KeypointRegressor:
+    if isinstance(joints, Tracer):
+        raise TypeError("joints must be known: got a traced array; make the regressor outside jit.")
+    try:
+        given = np.asarray(joints.toarray() if hasattr(joints, "toarray") else joints)
+    except ValueError:  # rows of different lengths
+        given = np.empty(0, object)
+    if not (np.issubdtype(given.dtype, np.floating) or np.issubdtype(given.dtype, np.integer)):
+        raise TypeError(
+            "joints must be a layout's name, a list of names or of joint indices, or an array of "
+            f"weights: got {type(joints).__name__}."
+        )
+    columns = given.shape[-1] if given.ndim == 2 and len(given) else -1
+    if columns not in (body.num_vertices, body.num_joints):
+        raise ValueError(
+            f"joints must be (K, {body.num_vertices}), from this body's vertices, or "
+            f"(K, {body.num_joints}), from its joints: got shape {given.shape}; a regressor made "
+            "for SMPL's 6890 vertices fits only a body with SMPL's mesh."
+        )
+    weights = given.astype(np.float64)
+    if not np.isfinite(weights).all():
+        row = int(np.flatnonzero(~np.isfinite(weights).all(axis=1))[0])
+        raise ValueError(f"joints must be finite: got NaN or infinity in row {row}.")
+    sums = weights.sum(axis=1)
+    if np.abs(sums - 1).max() > 1e-2:
+        row = int(np.abs(sums - 1).argmax())
+        raise ValueError(
+            f"joints must have rows that sum to 1, or keypoints would not move with the body: got "
+            f"{sums[row]:.4g} in row {row}; divide each row by its sum."
+        )
+    dtype = body.template.dtype
+    labels = _labels(names, len(weights))
+    if columns == body.num_vertices:
+        used = np.flatnonzero((weights != 0).any(axis=0))
+        none = np.zeros((len(weights), body.num_joints))
+        vertices = tuple(int(vertex) for vertex in used)
+        return KeypointRegressor(
+            labels, vertices, jnp.asarray(none, dtype), jnp.asarray(weights[:, used], dtype)
+        )
+    none = np.zeros((len(weights), 0))
+    return KeypointRegressor(labels, (), jnp.asarray(weights, dtype), jnp.asarray(none, dtype))
+
+
+def _labels(names: str | Sequence[str] | None, count: int) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"point{k}" for k in range(count))
+    if isinstance(names, str):
+        return as_layout(names, count).names
+    if not _is_sequence_of(names, str) or len(names) != count:
+        raise ValueError(
+            f"names must be a layout's name or {count} strings, one a row: got {names!r}."
+        )
+    return tuple(names)
