@@ -1,5 +1,8 @@
 """Keypoints: their layouts, their places on a body, and files of them."""
 
+from .entries import Person as Person
+from .files import KeypointFile as KeypointFile
+from .files import read_keypoints as read_keypoints
 from .landmarks import find_landmarks as find_landmarks
 from .layouts import LAYOUTS as LAYOUTS
 from .layouts import Layout as Layout

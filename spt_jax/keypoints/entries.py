@@ -1,0 +1,178 @@
+"""One person's numbers in a file of keypoints, checked one by one."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .layouts import LAYOUTS, Layout, as_layout
+
+#: Confidence of a point that COCO's annotators marked as hidden (v = 1): they guessed its place.
+OCCLUDED = 0.5
+
+# No camera has a million pixels in a row: such a number is another column, or damage.
+_FARTHEST = 1e6
+# Some detectors give scores above 1, but not such; it is another column.
+_SUREST = 100.0
+_COLUMNS = ("x", "y", "confidence")
+
+
+class Person(NamedTuple):
+    """One person's keypoints in one image.
+
+    Attributes:
+        points: in pixels from the top left; (0, 0) where missing.
+        confidence: of each point, from 0, missing, to 1.
+        layout: the name of the keypoints' order, a key of `spt_jax.keypoints.LAYOUTS`.
+        image: the image's file name, or its id where the file knows no more; or None.
+        width, height: of that image in pixels, or None.
+        id: the person's own id in the file, or None.
+        score: the detector's confidence in the whole person, or None.
+    """
+
+    points: Float[np.ndarray, "K 2"]
+    confidence: Float[np.ndarray, "K"]
+    layout: str
+    image: str | int | None = None
+    width: int | None = None
+    height: int | None = None
+    id: str | int | None = None
+    score: float | None = None
+
+
+def as_rows(where: str, values: Any) -> list[Any]:
+    """The numbers of [x, y, c, x, y, c, ...], [[x, y, c], ...] or [[x, y], ...], as one flat list.
+
+    Raises:
+        ValueError: it is no such list; `where` names the file and the person.
+    """
+    if isinstance(values, np.ndarray):
+        values = values.tolist()
+    if not isinstance(values, list) or not values:
+        raise ValueError(
+            f"{where} must be a list of x, y and confidence: got {_shown(values)}; leave out a "
+            "person without keypoints."
+        )
+    if not any(isinstance(row, list) for row in values):
+        if len(values) % 3:
+            raise ValueError(
+                f"{where} must have three numbers a keypoint, x, y and confidence: got "
+                f"{len(values)} numbers; the list is cut or of another kind."
+            )
+        return values
+    flat = []
+    for k, row in enumerate(values):
+        if not isinstance(row, list) or len(row) not in (2, 3) or len(row) != len(values[0]):
+            raise ValueError(
+                f"{where} must have rows [x, y, confidence], or all [x, y]: got {_shown(row)} for "
+                f"keypoint {k}."
+            )
+        flat += [*row, 1.0] if len(row) == 2 else row
+    return flat
+
+
+def choose_layout(
+    where: str, flat: list[Any], wanted: str | None, usual: tuple[str, ...]
+) -> Layout:
+    """The layout asked for, or the one of the format's own that has so many keypoints.
+
+    Raises:
+        ValueError: it has another count, or the format has none of that count.
+    """
+    count = len(flat) // 3
+    if wanted is not None:
+        try:
+            return as_layout(wanted, count)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from error
+    for name in usual:
+        if len(LAYOUTS[name].names) == count:
+            return LAYOUTS[name]
+    counts = " or ".join(f"{len(LAYOUTS[name].names)} ({name})" for name in usual)
+    rule = f"must have {counts} keypoints" if usual else "needs a layout, which the file lacks"
+    raise ValueError(
+        f"{where} {rule}: got {count}; name the layout that it has, one of {', '.join(LAYOUTS)}."
+    )
+
+
+def as_points(
+    where: str, flat: list[Any], layout: Layout, *, flags: bool = False
+) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K"]]:
+    """Points and confidences of checked numbers.
+
+    Args:
+        where: names the file and the person, for errors.
+        flat: x, y and confidence of each keypoint in turn.
+        layout: names the keypoints, for errors.
+        flags: the third number is COCO's v: 0 not labelled, 1 labelled but hidden, 2 visible.
+
+    Returns:
+        Pixels, (0, 0) where missing, and confidences from 0 to 1; larger ones, which some detectors
+        give, become 1.
+
+    Raises:
+        ValueError: an entry is no number, is not finite, is out of range; a v that is none.
+    """
+    numbers = np.empty(len(flat))
+    for index, value in enumerate(flat):
+        keypoint, column = divmod(index, 3)
+        entry = f"{_COLUMNS[column]} of keypoint {keypoint} ({layout.names[keypoint]})"
+        numbers[index] = as_number(f"{where}: {entry}", value)
+        limit = _SUREST if column == 2 else _FARTHEST
+        if abs(numbers[index]) > limit:
+            raise ValueError(f"{where}: {entry} must be at most {limit:g} in size: got {value!r}.")
+        if column < 2:
+            continue
+        if flags and value not in (0, 1, 2):
+            raise ValueError(f"{where}: {entry} must be 0, 1 or 2, COCO's v: got {value!r}.")
+        if numbers[index] < 0:
+            raise ValueError(
+                f"{where}: {entry} must not be negative: got {value!r}; 0 means missing."
+            )
+    rows = numbers.reshape(-1, 3)
+    confidence = np.array([0, OCCLUDED, 1])[rows[:, 2].astype(int)] if flags else rows[:, 2]
+    confidence = np.minimum(confidence, 1.0)
+    return np.where(confidence[:, None] > 0, rows[:, :2], 0.0), confidence
+
+
+def as_number(where: str, value: Any) -> float:
+    """A finite number.
+
+    Raises:
+        ValueError: it is none; `where` names the entry.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{where} must be a number: got {_shown(value)}.")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = np.inf
+    if not np.isfinite(number):
+        raise ValueError(
+            f"{where} must be finite: got {number}; a missing point is (0, 0) with confidence 0."
+        )
+    return number
+
+
+def as_size(where: str, value: Any) -> int | None:
+    """A width or height in whole pixels; None stays None.
+
+    Raises:
+        ValueError: it is no positive number.
+    """
+    if value is None:
+        return None
+    number = as_number(where, value)
+    if not 1 <= number <= _FARTHEST:
+        raise ValueError(f"{where} must be a number of pixels, 1 or more: got {value!r}.")
+    return round(number)
+
+
+def as_label(value: Any) -> str | int | None:
+    """A name or an id; anything else is no label."""
+    return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
