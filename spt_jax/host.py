@@ -18,6 +18,7 @@ Four traps shape this file:
 
 import atexit
 import functools
+import itertools
 import math
 import os
 import threading
@@ -32,6 +33,8 @@ import numpy as np
 from jaxtyping import Array, Float, Integer
 
 from spt_jax.overlap.measure import Map
+from spt_jax.recent import Recent
+from spt_jax.workers import Workers, usable_cores
 
 _PIECE_BYTES = 96 * 1024
 
@@ -48,11 +51,14 @@ def call_on_host(
     vertices: Float[Array, "*batch V 3"],
     faces: Integer[Array, "F 3"],
 ) -> tuple[Array, ...]:
-    """Run a NumPy function once per mesh of the batch, on as many threads as the process may use.
+    """Run a NumPy function once per mesh of the batch, in as many processes as there are cores.
+
+    Results of the last meshes are remembered, in 64 MB: a mesh that comes again is not measured
+    again, and neither are equal meshes of one batch.
 
     Args:
-        function: a module-level function; its identity is part of the cache key, so a lambda made
-            anew for each call would be traced anew for each call.
+        function: a module-level function, pure; its identity is part of the cache key, so a lambda
+            made anew for each call would be traced anew for each call.
         options: handed on as they are.
         results: for each result, its shape for one mesh and its dtype. Where nothing can be
             measured, numbers come back as NaN and arrays as zeros.
@@ -133,19 +139,29 @@ def _host_entry(function, options, results, vertices_spec, faces_spec):
             return _as_words(nothing, results)
 
     def measured(vertex_pieces, face_pieces):
-        vertices = _join(vertex_pieces, *vertices_spec).astype(np.float64)
-        faces = _join(face_pieces, *faces_spec).astype(np.int64)
-        faces = np.broadcast_to(faces, (num_meshes, *faces.shape[1:]))
-        meshes = list(zip(vertices, faces, strict=True))
-        if num_meshes == 1:
-            found = [function(*meshes[0], options, parallel_map)]
-        else:
-            found = parallel_map(lambda mesh: function(*mesh, options, map), meshes)
+        vertices = _join(vertex_pieces, *vertices_spec)
+        faces = [_recent.faces(one) for one in _join(face_pieces, *faces_spec)]
+        meshes = list(zip(vertices, itertools.cycle(faces), strict=False))
+        found = _recent.results((function, options, results), meshes, measured_anew)
         stacked = [
-            np.array([one[k] for one in found]).reshape(num_meshes, *shape)
-            for k, (shape, _) in enumerate(results)
+            np.array([one[k] for one in found], dtype).reshape(num_meshes, *shape)
+            for k, (shape, dtype) in enumerate(results)
         ]
         return _as_words(stacked, results)
+
+    def measured_anew(meshes):
+        meshes = [(vertices.astype(np.float64), faces) for vertices, faces in meshes]
+        if len(meshes) == 1:
+            found = [function(*meshes[0], options, parallel_map)]
+        else:
+            found = _workers.measure(function, options, meshes, _executor)
+        return [
+            tuple(
+                np.asarray(array).reshape(shape).astype(dtype)
+                for array, (shape, dtype) in zip(one, results, strict=True)
+            )
+            for one in found
+        ]
 
     return run_on_host
 
@@ -175,7 +191,7 @@ def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
             return function(item)
 
     items = list(items)
-    if len(items) < 2 or _usable_cores() < 2:
+    if len(items) < 2 or usable_cores() < 2:
         return [quietly(item) for item in items]
     try:
         futures = [_executor().submit(quietly, item) for item in items]
@@ -185,21 +201,30 @@ def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
     return [future.result() for future in futures]
 
 
-def _usable_cores() -> int:
-    # The affinity, not the machine: containers and job schedulers hand out fewer cores.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 @functools.cache
 def _executor() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_usable_cores(), thread_name_prefix="spt_jax")
+    return ThreadPoolExecutor(usable_cores(), thread_name_prefix="spt_jax")
+
+
+_recent = Recent()
+_workers = Workers()
+
+
+def forget() -> None:
+    """Forget what was measured, for those who time it."""
+    _recent.forget()
+
+
+def _begin_anew() -> None:
+    global _recent
+    # A forked child inherits the executor but not its threads, and locks as they are.
+    _executor.cache_clear()
+    _recent = Recent()
+    _workers.leave_to_parent()
 
 
 if hasattr(os, "register_at_fork"):
-    # A forked child inherits the executor but not its threads.
-    os.register_at_fork(after_in_child=_executor.cache_clear)
+    os.register_at_fork(after_in_child=_begin_anew)
 
 
 class _Traffic:
@@ -247,6 +272,13 @@ def _finish_pending_work() -> None:
     """
     if not _traffic.has_been():
         return
+    try:
+        _wait_for_quiet()
+    finally:
+        _workers.close()
+
+
+def _wait_for_quiet() -> None:
     for leaving, seconds in ((False, 2.0), (True, 5.0)):
         _traffic.leaving = leaving
         deadline = time.monotonic() + seconds

@@ -124,7 +124,8 @@ def test_threads_do_not_change_the_result(monkeypatch):
     batch = jnp.stack([jnp.asarray(vertices * s, "float32") for s in (1.0, 1.1, 1.2)])
     step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=64).sum())
     threaded = jax.block_until_ready(step(batch))
-    monkeypatch.setattr(host, "_usable_cores", lambda: 1)
+    monkeypatch.setattr(host, "usable_cores", lambda: 1)
+    host.forget()
     alone = jax.block_until_ready(step(batch))
     assert threaded[0] == alone[0]
     np.testing.assert_array_equal(threaded[1], alone[1])

@@ -1,0 +1,13 @@
+"""Start a worker, say its number, and be killed."""
+
+import os
+import signal
+
+from spt_jax import workers
+from spt_jax.penalty import _value_on_host
+
+workers._WORTH_STARTING = 0.0
+pool = workers.Workers()
+assert pool._ready(workers._packed(_value_on_host, None), 1) == []  # starts one
+print(pool._free[0]._process.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)

@@ -1,0 +1,174 @@
+"""Other processes that measure along: the same bits, and no harm whatever becomes of them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import join, sampling, sphere
+
+from spt_jax import workers
+from spt_jax.overlap.exclusions import NOTHING, Exclusions
+from spt_jax.penalty import _Options, _value_and_gradient_on_host
+from spt_jax.rest_surface import RestSurface
+
+SCRIPTS = Path(__file__).parent / "scripts"
+OPTIONS = _Options("volume", "boundary", "vertex", sampling("auto"), NOTHING)
+
+pytestmark = pytest.mark.skipif(not workers._can_start(), reason="no workers on this system")
+
+
+@pytest.fixture(autouse=True)
+def two_cores_and_any_batch(monkeypatch):
+    monkeypatch.setattr(workers, "usable_cores", lambda: 2)
+    monkeypatch.setattr(workers, "_WORTH_STARTING", 0.0)
+    monkeypatch.setattr(workers, "_WORTH_SHARING", 0)
+
+
+@pytest.fixture
+def pool():
+    pool = workers.Workers()
+    yield pool
+    pool.close()
+
+
+@pytest.fixture(scope="module")
+def executor():
+    with ThreadPoolExecutor(2) as executor:
+        yield executor
+
+
+def batch(count=6):
+    vertices, faces = join(sphere(), sphere(center=(1.1, 0.2, 0.1)))
+    return [(vertices * (1 + 0.1 * k), faces) for k in range(count)]
+
+
+def until_ready(pool, options=OPTIONS):
+    """Wait for the worker, as a solver would: by asking again."""
+    work = workers._packed(_value_and_gradient_on_host, options)
+    for _ in range(2000):
+        if ready := pool._ready(work, 1):
+            pool._release(ready[0])
+            return ready[0]
+        time.sleep(0.01)
+    raise TimeoutError
+
+
+def count_answers(worker, monkeypatch):
+    answers = []
+    measure = type(worker).measure
+
+    def counting(self, *arguments):
+        answers.append(measure(self, *arguments))
+        return answers[-1]
+
+    monkeypatch.setattr(type(worker), "measure", counting)
+    return answers
+
+
+def check(pool, executor, meshes, options=OPTIONS):
+    found = pool.measure(_value_and_gradient_on_host, options, meshes, lambda: executor)
+    for mesh, (value, gradient) in zip(meshes, found, strict=True):
+        expected = _value_and_gradient_on_host(*mesh, options, map)
+        assert value == expected[0] > 0
+        np.testing.assert_array_equal(gradient, expected[1])
+
+
+def test_same_bits_as_here_with_new_faces_and_options(pool, executor, monkeypatch):
+    check(pool, executor, batch())  # while it starts, all is done here
+    answers = count_answers(until_ready(pool), monkeypatch)
+    check(pool, executor, batch())
+    assert 0 < len(answers) < 6
+    check(pool, executor, [(v, np.roll(f, 1, axis=1).copy()) for v, f in batch()])
+    # Held by a lock that no other process can have: it is made anew there.
+    rest = RestSurface(*batch()[0], distance=0.01)
+    folds = OPTIONS._replace(exclusions=Exclusions(rest=rest))
+    until_ready(pool, folds)
+    before = len(answers)
+    check(pool, executor, batch(), folds)
+    assert len(answers) > before
+
+
+def test_forgets_what_is_long_ago(pool, executor):
+    for k in range(workers._REMEMBERED + 2):
+        options = OPTIONS._replace(sampling=sampling(8 + k))
+        worker = until_ready(pool, options)
+    assert len(worker._known) == workers._REMEMBERED
+    check(pool, executor, batch(2), options)
+
+
+def test_one_that_dies_or_hangs_is_replaced_until_too_many_are_lost(pool, executor, monkeypatch):
+    monkeypatch.setattr(workers, "_PATIENCE", (0.2, 0.0))
+    for number, harm in enumerate((signal.SIGKILL, signal.SIGSTOP, signal.SIGKILL)):
+        worker = until_ready(pool)
+        worker._process.send_signal(harm)
+        check(pool, executor, batch())
+        assert worker._process.poll() is not None  # not left behind
+        assert pool._losses == number + 1
+    check(pool, executor, batch())
+    assert pool._free == []
+
+
+def test_errors_are_raised_here_and_leave_no_worker_busy(pool, executor):
+    until_ready(pool)
+    meshes = [(None, batch()[0][1]), *batch()]
+    with pytest.raises(TypeError):
+        pool.measure(_value_and_gradient_on_host, OPTIONS, meshes, lambda: executor)
+    check(pool, executor, batch())
+
+
+def test_functions_that_another_process_cannot_find_stay_here(pool, executor):
+    def double(vertices, faces, options, map_tasks):
+        return (2 * vertices,)
+
+    assert workers._packed(double, None) is None
+    found = pool.measure(double, None, batch(2), lambda: executor)
+    np.testing.assert_array_equal(found[1][0], 2 * batch(2)[1][0])
+    assert pool._free == []
+
+
+def test_nothing_is_started_before_it_is_worth_it(pool, executor, monkeypatch):
+    monkeypatch.setattr(workers, "_WORTH_STARTING", 100.0)
+    check(pool, executor, batch(2))
+    assert pool._free == []
+    monkeypatch.setattr(workers, "_WORTH_STARTING", 0.0)
+    monkeypatch.setattr(sys, "executable", "/usr/bin/blender")
+    check(pool, executor, batch(2))
+    assert pool._free == []
+
+
+def test_ends_with_its_parent_even_if_that_is_killed():
+    done = subprocess.run(
+        [sys.executable, SCRIPTS / "ends_with_its_parent.py"], capture_output=True, timeout=60
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    pid = int(done.stdout.split()[0])
+    for _ in range(1000):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        if Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            return  # ended; nobody has asked for its status
+        time.sleep(0.01)
+    raise AssertionError("the worker is still there")
+
+
+def test_a_forked_child_leaves_them_to_its_parent(pool, executor):
+    worker = until_ready(pool)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX and Python warn of forks in threaded processes
+        child = os.fork()
+    if child == 0:
+        pool.leave_to_parent()
+        os._exit(0 if pool._free == [] and pool._number == 0 else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert worker._process.poll() is None
+    check(pool, executor, batch())
+    assert pool._losses == 0
