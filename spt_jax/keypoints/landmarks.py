@@ -27,10 +27,10 @@ _OFFICIAL = {
     },
 }
 
-# Heights above the tip of the nose, per distance from there to the top of the head, and the eyes'
-# distance from the middle per half of the head's width over the ears. On the embedded body the
-# eyes' middles are at 0.24 and 0.34; people's are 63 mm apart on a width of 185 mm.
-_EYE_HEIGHT, _EYE_SIDE, _EAR_HEIGHT = 0.24, 0.34, 0.12
+# The eyes' height above the tip of the nose, per distance from there to the top of the head, and
+# their distance from the middle, per half of the head's width over the ears. So they lie on the
+# embedded body; people's are 63 mm apart on a width of 185 mm, 0.34 too.
+_EYE_HEIGHT, _EYE_SIDE = 0.24, 0.34
 
 
 def find_landmarks(body: BodyModel) -> dict[str, int]:
@@ -43,8 +43,9 @@ def find_landmarks(body: BodyModel) -> dict[str, int]:
 
         nose                the foremost of the head near its mid-plane
         head_top            the highest of the head near its mid-plane
-        eyes, ears          the nearest, seen from the front, to fixed proportions of nose, top and
-                            width: half-way up the face, and outermost at the nose's bridge
+        eyes                the nearest, seen from the front, to fixed proportions of nose, top and
+                            width
+        ears                the middle of the outermost tenth of the head
         big toes            the foremost of the foot
         small toes          the foremost of the foot's outer border
         heels               the hindmost of the foot near the ground
@@ -94,14 +95,16 @@ def _of_the_head(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> dict[st
     found = {"nose": nose, "head_top": top}
     for side, outward in (("left", half), ("right", -half)):
         eye = middle + _EYE_SIDE * outward, head[nose, 1] + _EYE_HEIGHT * rise
-        ear = middle + outward, head[nose, 1] + _EAR_HEIGHT * rise
         away = np.linalg.norm(head[:, :2] - eye, axis=1)
         # Behind an eye lie its socket (the embedded body's are hollow, 3 cm deep) and the back of
         # the head: what counts is within a twentieth of the head's depth of the foremost there.
         around = away <= max(0.12 * abs(outward), away.min())
         front = head[:, 2] >= head[around, 2].max() - 0.05 * (high[2] - low[2])
         found[f"{side}_eye"] = _best(-away, around & front)
-        found[f"{side}_ear"] = _best(-np.linalg.norm(head[:, :2] - ear, axis=1))
+        # The middle of what stands out, across: the outermost vertex alone is the ear's rim.
+        ear = (head[:, 0] - middle) / outward >= 0.9
+        center = (head[ear, 1:].min(axis=0) + head[ear, 1:].max(axis=0)) / 2
+        found[f"{side}_ear"] = _best(-np.linalg.norm(head[:, 1:] - center, axis=1), ear)
     return {name: int(rows[k]) for name, k in found.items()}
 
 
