@@ -1,22 +1,29 @@
 """Laws of spt_jax.body.skinning; test_body_model.py compares it with the slow reference."""
 
-from itertools import pairwise
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from helpers_body import PARENTS, slow_rotation
 
 from spt_jax.body.rotations import matrix_from_axis_angle
-from spt_jax.body.skinning import forward_kinematics, linear_blend_skinning, tree_levels
+from spt_jax.body.skinning import (
+    ancestor_doublings,
+    forward_kinematics,
+    linear_blend_skinning,
+)
 
 
-def test_levels_hold_every_joint_once_and_parents_one_level_up():
+def test_doublings_are_the_ancestors_one_two_four_steps_up():
     for parents in PARENTS.values():
-        levels = tree_levels(tuple(parents))
-        assert sorted(joint for level in levels for joint in level) == list(range(len(parents)))
-        for above, level in pairwise(levels):
-            assert all(parents[joint] in above for joint in level)
+        count, depth = len(parents), 0
+        for k, row in enumerate(ancestor_doublings(tuple(parents))):
+            for joint, above in enumerate(row):
+                way = [joint]
+                while parents[way[-1]] >= 0:
+                    way.append(parents[way[-1]])
+                depth = max(depth, len(way))
+                assert above == (way[2**k] if len(way) > 2**k else count)
+        assert 2 ** (k + 1) >= depth > 2**k
 
 
 def test_forward_kinematics_equals_a_walk_joint_by_joint(rng, x64):

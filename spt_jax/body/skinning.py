@@ -12,27 +12,27 @@ _EXACT = jax.lax.Precision.HIGHEST
 
 
 @lru_cache
-def tree_levels(parents: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-    """Joints of a kinematic tree grouped by their depth, root first.
+def ancestor_doublings(parents: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    """For each joint its ancestor 1, 2, 4, ... steps up, until all have left the tree.
 
     Args:
-        parents: the parent of each joint, before its children; -1 for a root.
+        parents: the parent of each joint; -1 for a root.
 
     Returns:
-        One tuple of joint indices for each depth.
+        One tuple of joint indices for each doubling; the number of joints stands for "none".
 
     Example:
-        >>> from spt_jax.body.skinning import tree_levels
-        >>> tree_levels((-1, 0, 0, 1))
-        ((0,), (1, 2), (3,))
+        >>> from spt_jax.body.skinning import ancestor_doublings
+        >>> ancestor_doublings((-1, 0, 1, 2))
+        ((4, 0, 1, 2), (4, 4, 0, 1))
     """
-    depth: list[int] = []
-    for parent in parents:
-        depth.append(0 if parent < 0 else depth[parent] + 1)
-    return tuple(
-        tuple(joint for joint, d in enumerate(depth) if d == level)
-        for level in range(max(depth) + 1)
-    )
+    none = len(parents)
+    up = [parent if parent >= 0 else none for parent in parents] + [none]
+    steps = []
+    while min(up) < none:
+        steps.append(tuple(up[:-1]))
+        up = [up[above] for above in up]
+    return tuple(steps)
 
 
 def forward_kinematics(
@@ -43,7 +43,9 @@ def forward_kinematics(
     """World rotation and position of every joint, from rotations relative to the parents.
 
     R_j = R_parent r_j and p_j = p_parent + R_parent (J_j - J_parent); a root stays where it is.
-    All joints of one depth move in one batched product, so a hand of 15 joints costs three.
+    The products along the way to the root are built by doubling: after k rounds each joint has
+    that of 2^k joints, so that a tree of depth 11 takes four batched products. Depth by depth it
+    took twice as long to compile, and 0.11 in place of 0.06 ms with the gradient.
 
     Args:
         rotations: each joint's rotation relative to its parent.
@@ -63,29 +65,23 @@ def forward_kinematics(
         >>> forward_kinematics(turn, rest, (-1, 0))[1].tolist()
         [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     """
-    levels = tree_levels(parents)
-    place = {joint: k for level in levels for k, joint in enumerate(level)}
     batch = jnp.broadcast_shapes(rotations.shape[:-3], joints.shape[:-2])
-    first = np.array(levels[0])
-    rotation = jnp.broadcast_to(rotations[..., first, :, :], (*batch, len(first), 3, 3))
-    position = jnp.broadcast_to(joints[..., first, :], (*batch, len(first), 3))
-    all_rotations, all_positions = [rotation], [position]
-    for level in levels[1:]:
-        here = np.array(level)
-        up = np.array([parents[joint] for joint in level])
-        above = np.array([place[joint] for joint in up])
-        offset = joints[..., here, :] - joints[..., up, :]
-        above_rotation = rotation[..., above, :, :]
-        # A sum of products, not a matmul: XLA fuses it, and needs 0.05 ms less for 3 x 3 on a CPU.
-        position = position[..., above, :] + jnp.sum(above_rotation * offset[..., None, :], axis=-1)
-        rotation = jnp.matmul(above_rotation, rotations[..., here, :, :], precision=_EXACT)
-        all_rotations.append(rotation)
-        all_positions.append(position)
-    order = np.argsort([joint for level in levels for joint in level])
-    return (
-        jnp.concatenate(all_rotations, axis=-3)[..., order, :, :],
-        jnp.concatenate(all_positions, axis=-2)[..., order, :],
-    )
+    rotation = jnp.broadcast_to(rotations, (*batch, *rotations.shape[-3:]))
+    up = np.array([parent if parent >= 0 else joint for joint, parent in enumerate(parents)])
+    has_parent = (np.array(parents) >= 0).reshape(*(1,) * (joints.ndim - 2), -1, 1)
+    offset = jnp.where(has_parent, joints - joints[..., up, :], joints)
+    position = jnp.broadcast_to(offset, (*batch, *offset.shape[-2:]))
+    # What is above a root: nothing turned and nothing moved, in the row after the last joint's.
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=rotation.dtype), (*batch, 1, 3, 3))
+    zero = jnp.zeros((*batch, 1, 3), position.dtype)
+    for step in ancestor_doublings(parents):
+        above = np.array(step)
+        turn = jnp.concatenate([rotation, eye], axis=-3)[..., above, :, :]
+        move = jnp.concatenate([position, zero], axis=-2)[..., above, :]
+        # Sums of products, not matmuls: XLA fuses them, and needs 0.05 ms less for 3 x 3 on a CPU.
+        position = move + jnp.sum(turn * position[..., None, :], axis=-1)
+        rotation = jnp.sum(turn[..., :, :, None] * rotation[..., None, :, :], axis=-2)
+    return rotation, position
 
 
 def linear_blend_skinning(
