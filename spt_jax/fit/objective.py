@@ -1,0 +1,146 @@
+"""What a fit minimises before any regulariser: keypoints, prior, limits, as a sum of squares."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from spt_jax.body.rotations import matrix_from_axis_angle
+from spt_jax.camera import PinholeCamera
+from spt_jax.fit.figure import Figure, Variables
+from spt_jax.fit.priors import GaussianPosePrior, JointLimits
+
+# Per squared radian (and squared unit of shape, and squared metre) away from the start. It decides
+# where nothing else does, as for the twist of a limb without a prior; a radian costs as much as
+# one keypoint that is off by 3 % of its expected error.
+_RIDGE = 1e-3
+
+# Added to the Gauss-Newton matrix whose factor the penalty's stages take as coordinates, per
+# squared radian: directions that the keypoints say nothing about would else be endlessly long.
+_STIFFNESS = 1.0
+
+
+class Weights(NamedTuple):
+    """What each term counts for; the reprojection's weight is 1."""
+
+    prior: Float[Array, ""]
+    limits: Float[Array, ""]
+    shape: Float[Array, ""]
+    upright: Float[Array, ""]
+
+
+class Objective(eqx.Module):
+    """The squares of one person's fit.
+
+    With c_k the confidence of keypoint k, e_k its distance in the image from where the body has it
+    and s the expected error in pixels,
+
+        sum over k of c_k rho(e_k / s)                      reprojection, rho(x) = x^2, or
+                                                            x^2 / (1 + x^2 / g^2) (Geman-McClure)
+        + prior weight * Mahalanobis distance^2 of the pose
+        + limits weight * sum of (angle beyond its range / 0.1 rad)^2
+        + shape weight * |shape|^2
+        + upright weight * |body's up - up|^2.
+
+    The variables of a solver are the rotations of the joints that move, then the translation and
+    the shape where they are fitted, in one vector.
+    """
+
+    figure: Figure
+    camera: PinholeCamera
+    keypoints: Float[Array, "K 2"]
+    confidence: Float[Array, "K"]
+    pixels: Float[Array, ""]  # s, the expected error
+    robust: Float[Array, ""] | None  # g, in units of s
+    prior: GaussianPosePrior | None  # of the joints that move
+    limits: JointLimits | None  # likewise
+    weights: Weights
+    up: Float[Array, "3"]
+    start: Variables  # of the whole body
+    fit_shape: bool = eqx.field(static=True)
+    fit_translation: bool = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The keypoints' names."""
+        return self.figure.regressor.names
+
+    def pack(self, variables: Variables) -> Float[Array, "D"]:
+        """The vector of what is fitted."""
+        return self.repacked(variables._replace(pose=variables.pose[self.figure.rows]))
+
+    def unpack(self, vector: Float[Array, "D"]) -> Variables:
+        """The whole body's parameters: those of the vector, and those that are held fixed."""
+        moved = self.moved(vector)
+        return moved._replace(pose=self.start.pose.at[self.figure.rows].set(moved.pose))
+
+    def moved(self, vector: Float[Array, "D"]) -> Variables:
+        """The figure's parameters: of the joints that move alone."""
+        end = 3 * len(self.figure.moving)
+        pose = vector[:end].reshape(-1, 3)
+        translation, shape = self.start.translation, self.start.shape
+        if self.fit_translation:
+            translation, end = vector[end : end + 3], end + 3
+        if self.fit_shape:
+            shape = vector[end:]
+        return Variables(pose, shape, translation)
+
+    def repacked(self, moved: Variables) -> Float[Array, "D"]:
+        """The vector of the figure's parameters."""
+        parts = [moved.pose.reshape(-1)]
+        if self.fit_translation:
+            parts.append(moved.translation)
+        if self.fit_shape:
+            parts.append(moved.shape)
+        return jnp.concatenate(parts)
+
+    def project(self, vector: Float[Array, "D"]) -> Float[Array, "K 2"]:
+        """The keypoints of the body in the image, in pixels."""
+        return self.camera.project(self.figure.points_and_joints(self.moved(vector))[0])
+
+    def residuals(self, vector: Float[Array, "D"]) -> dict[str, Array]:
+        """The terms' residuals, whose squares sum to the cost; `ridge` is not among the terms."""
+        moved = self.moved(vector)
+        off = (self.project(vector) - self.keypoints) / self.pixels
+        if self.robust is not None:
+            square = jnp.sum(off**2, axis=-1, keepdims=True)
+            off = off / jnp.sqrt(1 + square / self.robust**2)
+        found = {"reprojection": jnp.sqrt(self.confidence)[:, None] * off}
+        if self.prior is not None:
+            found["prior"] = jnp.sqrt(self.weights.prior) * self.prior.residuals(moved.pose)
+        if self.limits is not None:
+            found["limits"] = jnp.sqrt(self.weights.limits) * self.limits.residuals(moved.pose)
+        if self.fit_shape:
+            found["shape"] = jnp.sqrt(self.weights.shape) * moved.shape
+        found["upright"] = jnp.sqrt(self.weights.upright) * (
+            matrix_from_axis_angle(moved.pose[0])[:, 1] - self.up
+        )
+        found["ridge"] = jnp.sqrt(_RIDGE) * (vector - self.pack(self.start))
+        return found
+
+    def costs(self, vector: Float[Array, "D"]) -> dict[str, Float[Array, ""]]:
+        """The terms."""
+        return {name: jnp.sum(r**2) for name, r in self.residuals(vector).items()}
+
+    def cost(self, vector: Float[Array, "D"]) -> Float[Array, ""]:
+        """Their sum, the ridge included."""
+        return sum(self.costs(vector).values(), jnp.zeros((), vector.dtype))
+
+    def unwhitening(self, vector: Float[Array, "D"]) -> Float[Array, "D D"]:
+        """B such that in coordinates u, x = vector + B u, the cost is round near a point.
+
+        B = L^-T with L L^T the Gauss-Newton matrix. A first-order solver in those coordinates goes
+        straight to the keypoints' optimum, and what a regulariser adds is weighed against a plain
+        sum of squares.
+        """
+        jacobian = jax.jacfwd(lambda x: jnp.concatenate(_flat(self.residuals(x))))(vector)
+        matrix = jacobian.T @ jacobian
+        eye = jnp.eye(len(matrix), dtype=matrix.dtype)
+        factor = jnp.linalg.cholesky(matrix + _STIFFNESS * eye)
+        return jax.scipy.linalg.solve_triangular(factor, eye, trans=1, lower=True)
+
+
+def _flat(residuals: dict[str, Array]) -> list[Array]:
+    return [r.reshape(-1) for r in residuals.values()]

@@ -1,0 +1,279 @@
+"""A body's pose from keypoints in one image."""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from spt_jax.body import BodyModel
+from spt_jax.camera import PinholeCamera
+from spt_jax.fit.inputs import Person, as_people
+from spt_jax.fit.objective import Objective
+from spt_jax.fit.priors import GaussianPosePrior, JointLimits
+from spt_jax.fit.regularisers import Regulariser
+from spt_jax.fit.setup import Setup, as_limits, as_prior, make_setup
+from spt_jax.fit.stages import Descent, descend, unpacked
+
+# Candidates whose energy is looked at before two of them go through the regularised stages.
+_LOOKED_AT = 4
+
+_REASONS = (
+    "converged",
+    "stopped at the largest number of steps",
+    "not finite: keypoints or camera are unusable",
+    "no keypoint was seen: this is where the fit started",
+)
+
+
+class FitResult(eqx.Module):
+    """What `fit_pose` found.
+
+    Attributes:
+        pose: axis-angle of every joint, in radians.
+        shape: shape coefficients, those given where they were not fitted.
+        translation: in metres.
+        vertices, joints: the body, in metres, in the world of the camera.
+        keypoints: where the body's keypoints are in the image, in pixels.
+        steps: of the solvers, over all starts and stages.
+        terms: what each term costs at the end: "reprojection", "prior", "limits", "shape",
+            "upright" and the regulariser's name, weighted, those that were used; their sum is
+            "total". `fit_pose` says what they are.
+        status: 0 converged; 1 stopped at the largest number of steps; 2 not finite; 3 no keypoint
+            was seen. `reason` says it in words.
+    """
+
+    pose: Float[Array, "*batch J 3"]
+    shape: Float[Array, "*batch B"]
+    translation: Float[Array, "*batch 3"]
+    vertices: Float[Array, "*batch V 3"]
+    joints: Float[Array, "*batch J 3"]
+    keypoints: Float[Array, "*batch K 2"]
+    steps: Int[Array, "*batch"]
+    terms: dict[str, Float[Array, "*batch"]]
+    status: Int[Array, "*batch"]
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether the last stage ended at a minimum."""
+        return self.status == 0
+
+    @property
+    def reason(self) -> Any:
+        """The status in words: a string, or nested lists of strings over the batch axes."""
+        words = np.array(_REASONS, dtype=object)[np.asarray(self.status)]
+        return words if isinstance(words, str) else words.tolist()
+
+
+def fit_pose(
+    body: BodyModel,
+    keypoints: Any,
+    camera: PinholeCamera,
+    *,
+    joints: Any,
+    confidence: Any = None,
+    regulariser: Literal["spt", "none", "laplacian", "spheres"] | Regulariser = "spt",
+    pose: Any = None,
+    shape: Any = None,
+    translation: Any = None,
+    fit_shape: bool = False,
+    fit_translation: bool = True,
+    prior: Literal["mocap"] | GaussianPosePrior | None = "mocap",
+    limits: Literal["anatomical"] | JointLimits | None = "anatomical",
+    prior_weight: float = 1.0,
+    limits_weight: float = 1.0,
+    shape_weight: float = 1.0,
+    upright_weight: float = 0.25,
+    expected_error: float | None = None,
+    robust: float | None = None,
+    starts: int = 6,
+    solver: optx.AbstractMinimiser | None = None,
+    keypoint_solver: optx.AbstractMinimiser | None = None,
+    max_steps: int = 20,
+) -> FitResult:
+    """The pose of a body whose keypoints look like those given, and which is free of itself.
+
+    It minimises (section 4.3 of the paper, with what is needed to make the pose a person's)
+
+        sum over keypoints k of c_k rho(distance in the image / expected error)
+        + prior weight * squared Mahalanobis distance of the pose from the prior
+        + limits weight * sum of (angle beyond a joint's range / 0.1 rad)^2
+        + shape weight * |shape|^2 + upright weight * |body's up - image's up|^2
+        + the regulariser's last weight * its energy
+
+    first without the regulariser, from `starts` orientations and then through the depth flips of
+    each limb (a bone that leans towards the camera and its mirror image that leans away look the
+    same); then with it, its weight rising from stage to stage, from the two best of these, one
+    of them chosen with the regulariser in view. What ends with the lowest total is returned.
+    All of it is one compiled solve.
+
+    Args:
+        body: any `BodyModel`.
+        keypoints: pixels, x to the right and y down, (..., K, 2); or a list of people, each
+            (K, 2). People are fitted side by side and do not see each other: `fit_people` is for
+            those. A point whose confidence is 0 may be anything, NaN too.
+        camera: a `PinholeCamera`; with one that has no rotation the body comes back in the
+            camera's axes.
+        joints: what the K keypoints are: "coco17", "body25", "h36m17", "smpl", or whatever
+            `keypoint_regressor` takes.
+        confidence: (..., K), 0 for a point that was not seen; all 1 if None.
+        regulariser: "spt", the self-intersection penalty; "none"; "spheres" and "laplacian", the
+            rivals of the paper's section 4.4; or a `Regulariser` with weights of its own.
+        pose: where to start, (..., J, 3); then no other orientations and flips are tried.
+        shape: coefficients, (..., B); held fixed, or with `fit_shape` where to start.
+        translation: in metres, (..., 3); held fixed without `fit_translation`, else found from the
+            keypoints unless `pose` is given too.
+        fit_shape: whether to fit the shape.
+        fit_translation: whether to fit the translation.
+        prior: "mocap", a Gaussian of the embedded motion capture; one of your own (`pose_prior`);
+            or None.
+        limits: "anatomical", the ranges in `spt_jax.fit.priors`; `joint_limits` of your own; or
+            None.
+        prior_weight, limits_weight, shape_weight, upright_weight: what each term counts for.
+        expected_error: of a keypoint, in pixels; by None a hundredth of the larger side of the box
+            around a person's keypoints.
+        robust: Geman-McClure's scale in pixels (rho(x) = x^2 / (1 + (x / scale)^2)): keypoints
+            much farther off are taken for mistakes. By None rho(x) = x^2.
+        starts: how many orientations to try.
+        solver: of the regularised stages, any optimistix minimiser; BFGS by default.
+        keypoint_solver: of the keypoints' objective, likewise.
+        max_steps: of each regularised stage.
+
+    Returns:
+        FitResult with the batch axes of `keypoints`. It is never NaN for usable input: where a
+        stage fails, what was there before it stays.
+
+    Raises:
+        TypeError, ValueError: arguments of the wrong kind or shape, named in the message; where
+            values are known: keypoints that are seen and not finite, confidence negative or not
+            finite, nobody's keypoints seen, parameters that are not finite.
+
+    Differentiation: none is meant; it runs under jit and vmap.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import PinholeCamera, fit_pose, load_body
+        >>> body = load_body()
+        >>> camera = PinholeCamera(1000.0, (500.0, 500.0), translation=(0.0, 0.0, 4.0))
+        >>> turned = jnp.zeros((52, 3)).at[0, 0].set(jnp.pi)  # upright: the image's y points down
+        >>> seen = camera.project(body(turned).joints[:22])
+        >>> fit = fit_pose(body, seen, camera, joints=body.joint_names[:22], regulariser="none")
+        >>> bool(jnp.abs(fit.keypoints - seen).max() < 10)  # pixels, of a person of 460
+        True
+    """
+    likely = as_prior(body, prior)
+    setup = make_setup(
+        body,
+        camera,
+        _count(keypoints),
+        joints=joints,
+        people=1,
+        regulariser=regulariser,
+        search=pose is None,
+        fit_shape=fit_shape,
+        fit_translation=fit_translation,
+        prior=likely,
+        limits=as_limits(body, limits),
+        weights={
+            "prior": prior_weight,
+            "limits": limits_weight,
+            "shape": shape_weight,
+            "upright": upright_weight,
+        },
+        starts=starts,
+        solver=solver,
+        keypoint_solver=keypoint_solver,
+        max_steps=max_steps,
+    )
+    # A search starts from the middle of what is likely, or from rest.
+    middle = jnp.zeros((body.num_joints, 3)) if likely is None else likely.mean
+    people, batch = as_people(
+        body,
+        keypoints,
+        confidence,
+        (middle if pose is None else pose, shape, translation),
+        expected_error,
+        robust,
+    )
+    found = _fit_each(setup, people)
+    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
+
+
+@eqx.filter_jit
+def _fit_each(setup: Setup, people: Person) -> FitResult:
+    return jax.vmap(lambda person: _fit_one(setup, person))(people)
+
+
+def _fit_one(setup: Setup, person: Person) -> FitResult:
+    objective = setup.objective(person)
+    candidates = setup.candidates(objective)
+    alone = jax.tree.map(lambda leaf: leaf[None], objective)
+    weights = setup.regulariser.weights.astype(candidates.vectors.dtype)
+
+    def energy(vector):
+        now = unpacked(alone, vector[None])
+        start = jax.tree.map(lambda leaf: leaf[None], objective.start)
+        return setup.regulariser.energy(setup.body, start, now)
+
+    looked = candidates.vectors[:_LOOKED_AT]
+    energies = jax.vmap(energy)(looked)
+    # Judged with the middle weight: with the last one, a graze that costs nothing to end would
+    # count for more than a limb on the wrong side.
+    judged = candidates.costs[:_LOOKED_AT] + weights[len(weights) // 2] * energies
+    free = jnp.argmin(jnp.where(jnp.isnan(judged), jnp.inf, judged))
+    tracks = jnp.stack([looked[0], looked[free]])
+
+    def through_stages(vector):
+        return descend(
+            setup.regulariser, setup.body, alone, vector[None], setup.solver, setup.max_steps
+        )
+
+    ends = jax.vmap(through_stages)(tracks)
+    totals = ends.cost + weights[-1] * ends.energy
+    best = jnp.argmin(jnp.where(jnp.isnan(totals), jnp.inf, totals))
+    end = jax.tree.map(lambda leaf: leaf[best], ends)
+    return _result(setup, objective, end, candidates.steps + jnp.sum(ends.steps))
+
+
+def _result(setup: Setup, objective: Objective, end: Descent, steps) -> FitResult:
+    vector = end.vectors[0]
+    found = objective.unpack(vector)
+    posed = setup.body(found.pose, found.shape, found.translation)
+    terms = objective.costs(vector)
+    del terms["ridge"]
+    name = setup.regulariser.name
+    if name != "none":
+        terms[name] = setup.regulariser.weights[-1].astype(vector.dtype) * end.energy
+    terms["total"] = sum(terms.values(), jnp.zeros((), vector.dtype))
+    finite = jnp.all(jnp.isfinite(posed.vertices)) & jnp.isfinite(terms["total"])
+    status = jnp.where(end.converged, 0, 1)
+    status = jnp.where(finite, status, 2)
+    status = jnp.where(jnp.any(objective.confidence > 0), status, 3)
+    return FitResult(
+        pose=found.pose,
+        shape=found.shape,
+        translation=found.translation,
+        vertices=posed.vertices,
+        joints=posed.joints,
+        keypoints=objective.project(vector),
+        steps=steps,
+        terms=terms,
+        status=status,
+    )
+
+
+def _count(keypoints: Any) -> int:
+    """The number of keypoints, for the layout to be checked against."""
+    first = keypoints
+    if isinstance(keypoints, (list, tuple)) and len(keypoints) and np.ndim(keypoints[0]) > 1:
+        first = keypoints[0]
+    shape = np.shape(first)
+    if len(shape) < 2 or shape[-1] != 2:
+        raise ValueError(
+            f"keypoints must have shape (..., K, 2), pixels: got {shape}; a third column is the "
+            "confidence, which is an argument of its own."
+        )
+    return shape[-2]

@@ -1,0 +1,225 @@
+"""What keeps a fitted body from passing through itself: the penalty, and the paper's rivals."""
+
+import dataclasses
+from abc import abstractmethod
+from typing import Any, ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from spt_jax.arguments import as_choice, as_directions, as_margin, as_rays
+from spt_jax.body import BodyModel
+from spt_jax.fit.figure import Variables
+from spt_jax.fit.laplacian import MeshLaplacian, laplacian_penalty
+from spt_jax.fit.spheres import BodySpheres, sphere_penalty
+from spt_jax.geometry import inflate
+from spt_jax.groups import join_bodies
+from spt_jax.penalty import self_intersection_penalty
+from spt_jax.rest_surface import RestSurface
+
+_CENTIMETRE = 0.01
+
+
+class Regulariser(eqx.Module):
+    """A term that `fit_pose` adds to the keypoints' in stages, its weight rising.
+
+    Make your own by deriving from it: `energy` gets the parameters of one or several people, with
+    one leading axis, and is differentiated in reverse mode under jit.
+
+    Attributes:
+        weights: one for each stage, against a reprojection term in which a keypoint that is off by
+            its expected error counts 1.
+    """
+
+    name: ClassVar[str]
+    weights: eqx.AbstractVar[Float[Array, "stages"]]
+
+    def prepared(self, body: BodyModel, people: int) -> "Regulariser":
+        """Itself with what it has to know of the body; called outside jit."""
+        del body, people
+        return self
+
+    @abstractmethod
+    def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
+        """The term without its weight.
+
+        Args:
+            body: the model.
+            start: the parameters (N, ...) before the first stage.
+            now: the parameters (N, ...).
+        """
+
+
+class Nothing(Regulariser):
+    """No term: the keypoints, the prior and the limits alone ("RE only")."""
+
+    name: ClassVar[str] = "none"
+    weights: Float[Array, "stages"] = eqx.field(
+        converter=lambda given: as_weights(given), default=(0.0,)
+    )
+
+    def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
+        """Zero."""
+        return jnp.zeros((), now.pose.dtype)
+
+
+class SelfIntersection(Regulariser):
+    """The self-intersection penalty ("RE + SPT"), of all people together, in cm^3.
+
+    The weights rise from one at which the body slides along a contact to one that leaves next to
+    nothing of it.
+
+    Attributes:
+        folds: "ignore" leaves out the creases of skin at joints, "count" counts them as overlap.
+        margin: how far apart parts are pushed, in metres; 0 measures the surface as it is.
+        value, gradient: as in `self_intersection_penalty`. "ratio" with "unit" is the paper's term
+            (Eqs. 10 and 11), which has no line search: use it with `optimistix.GradientDescent`.
+            The ratio is in per cent then, and no gradient of the value.
+        rays, directions: as in `self_intersection_penalty`.
+    """
+
+    name: ClassVar[str] = "spt"
+    weights: Float[Array, "stages"] = eqx.field(
+        converter=lambda given: as_weights(given), default=(0.01, 0.1, 1.0)
+    )
+    _: dataclasses.KW_ONLY
+    folds: Literal["ignore", "count"] = eqx.field(static=True, default="ignore")
+    margin: float = eqx.field(static=True, default=0.0, converter=as_margin)
+    value: Literal["volume", "ratio"] = eqx.field(static=True, default="volume")
+    gradient: Literal["boundary", "vertex", "unit"] = eqx.field(static=True, default="boundary")
+    rays: Any = eqx.field(static=True, default="auto", converter=as_rays)
+    directions: Any = eqx.field(static=True, default=3, converter=as_directions)
+    rest: RestSurface | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        as_choice("folds", self.folds, Literal["ignore", "count"])
+        as_choice("value", self.value, Literal["volume", "ratio"])
+        as_choice("gradient", self.gradient, Literal["boundary", "vertex", "unit"])
+
+    def prepared(self, body: BodyModel, people: int) -> "SelfIntersection":
+        """With the rest surface that folds are told by."""
+        if self.folds == "count":
+            return self
+        rest = body.rest_surface
+        return dataclasses.replace(self, rest=rest.copies(people) if people > 1 else rest)
+
+    def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
+        """Overlap of all people with themselves and each other: cm^3, or per cent of vertices."""
+        vertices = body(now.pose, now.shape, now.translation).vertices
+        scene = join_bodies(vertices, body.faces)
+        surface = scene.vertices
+        if self.margin:
+            surface = inflate(surface, scene.faces, self.margin / 2)
+        found = self_intersection_penalty(
+            surface,
+            scene.faces,
+            value=self.value,
+            gradient=self.gradient,
+            rays=self.rays,
+            directions=np.array(self.directions),
+            folds=self.rest,
+        )
+        return found / _CENTIMETRE**3 if self.value == "volume" else found * 100
+
+
+class Spheres(Regulariser):
+    """Spheres in place of the surface ("RE + SA", Pons-Moll et al. 2015), in cm^2.
+
+    Attributes:
+        spheres: `BodySpheres` of the body; fitted to it if None.
+    """
+
+    name: ClassVar[str] = "spheres"
+    weights: Float[Array, "stages"] = eqx.field(
+        converter=lambda given: as_weights(given), default=(0.1, 1.0)
+    )
+    spheres: BodySpheres | None = None
+
+    def prepared(self, body: BodyModel, people: int) -> "Spheres":
+        """With the spheres of the body."""
+        if people > 1:
+            raise ValueError(
+                'regulariser must be "spt" or "none" for several people in one scene: got '
+                '"spheres", which knows one body\'s own parts.'
+            )
+        if self.spheres is not None:
+            return self
+        return dataclasses.replace(self, spheres=BodySpheres.fit(body))
+
+    def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
+        """Sum of squared depths of the spheres in each other, in cm^2."""
+        if self.spheres is None:
+            raise ValueError("spheres must be known: call prepared(body, people) first.")
+        found = sphere_penalty(self.spheres, body, now.pose, now.shape, now.translation)
+        return jnp.sum(found) / _CENTIMETRE**2
+
+
+class Laplacian(Regulariser):
+    """Laplacian regularisation ("RE + LR", Wang et al. 2018), in mm^2.
+
+    What bends the surface costs, wherever it lies: the mean squared change of the Laplacian
+    coordinates since the first stage began, in the body's own frame.
+    """
+
+    name: ClassVar[str] = "laplacian"
+    weights: Float[Array, "stages"] = eqx.field(
+        converter=lambda given: as_weights(given), default=(1.0,)
+    )
+    laplacian: MeshLaplacian | None = None
+
+    def prepared(self, body: BodyModel, people: int) -> "Laplacian":
+        """With the neighbours of the body's vertices."""
+        if self.laplacian is not None:
+            return self
+        found = MeshLaplacian.from_faces(np.asarray(body.faces), body.num_vertices)
+        return dataclasses.replace(self, laplacian=found)
+
+    def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
+        """Mean squared change of the Laplacian coordinates, in mm^2, summed over the people."""
+        if self.laplacian is None:
+            raise ValueError("laplacian must be known: call prepared(body, people) first.")
+
+        def own_frame(variables: Variables) -> Array:
+            pose = variables.pose.at[..., 0, :].set(0.0)
+            return body(pose, variables.shape).vertices
+
+        reference = jax.lax.stop_gradient(own_frame(start))
+        return jnp.sum(laplacian_penalty(self.laplacian, reference, own_frame(now))) * 1e6
+
+
+NAMED: dict[str, type[Regulariser]] = {
+    kind.name: kind for kind in (Nothing, SelfIntersection, Spheres, Laplacian)
+}
+
+
+def as_regulariser(regulariser: Any) -> Regulariser:
+    """A regulariser, or the one of a name with its usual weights.
+
+    Raises:
+        ValueError: an unknown name.
+        TypeError: neither a name nor a `Regulariser`.
+    """
+    if isinstance(regulariser, Regulariser):
+        return regulariser
+    if isinstance(regulariser, str) and regulariser in NAMED:
+        return NAMED[regulariser]()
+    listed = ", ".join(repr(name) for name in NAMED)
+    kind = ValueError if isinstance(regulariser, str) else TypeError
+    raise kind(f"regulariser must be one of {listed}, or a Regulariser: got {regulariser!r}.")
+
+
+def as_weights(weights: Any) -> Float[Array, "stages"]:
+    """Weights of the stages as an array.
+
+    Raises:
+        ValueError: none at all, or negative or not finite ones.
+    """
+    rows = np.atleast_1d(np.asarray(weights, np.float64))
+    if rows.ndim != 1 or not rows.size or not np.isfinite(rows).all() or rows.min() < 0:
+        raise ValueError(
+            f"weights must be finite and not negative, one for each stage: got {weights!r}."
+        )
+    return jnp.asarray(rows)

@@ -1,0 +1,156 @@
+"""What the people of one call share, checked and put together."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from spt_jax.body import BodyModel
+from spt_jax.camera import PinholeCamera
+from spt_jax.fit.candidates import Candidates, find_candidates, refine_start
+from spt_jax.fit.figure import Figure, make_figure
+from spt_jax.fit.flips import Limb, limbs_of
+from spt_jax.fit.inputs import Person
+from spt_jax.fit.objective import Objective, Weights
+from spt_jax.fit.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
+from spt_jax.fit.regularisers import Regulariser, as_regulariser
+from spt_jax.keypoints import keypoint_regressor
+
+# Of the fit to the keypoints alone, for each start: two in three need fewer.
+_KEYPOINT_STEPS = 60
+
+
+class Setup(eqx.Module):
+    """The model, the camera, the terms and the solvers of a fit."""
+
+    body: BodyModel
+    figure: Figure
+    camera: PinholeCamera
+    prior: GaussianPosePrior | None
+    limits: JointLimits | None
+    weights: Weights
+    regulariser: Regulariser
+    keypoint_solver: optx.AbstractMinimiser
+    solver: optx.AbstractMinimiser
+    limbs: tuple[Limb, ...] = eqx.field(static=True)
+    starts: int = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    fit_shape: bool = eqx.field(static=True)
+    fit_translation: bool = eqx.field(static=True)
+
+    def objective(self, person: Person) -> Objective:
+        """The squares of one person's fit."""
+        dtype = person.keypoints.dtype
+        up = self.camera.rotation.astype(dtype).T @ jnp.array([0.0, -1.0, 0.0], dtype)
+        return Objective(
+            figure=self.figure,
+            camera=self.camera,
+            keypoints=person.keypoints,
+            confidence=person.confidence,
+            pixels=person.pixels,
+            robust=person.robust,
+            prior=self.prior,
+            limits=self.limits,
+            weights=Weights(*(weight.astype(dtype) for weight in self.weights)),
+            up=up,
+            start=person.start,
+            fit_shape=self.fit_shape,
+            fit_translation=self.fit_translation,
+        )
+
+    def candidates(self, objective: Objective) -> Candidates:
+        """Fits to the keypoints alone, the best first."""
+        if not self.starts:
+            return refine_start(objective, self.keypoint_solver, 2 * _KEYPOINT_STEPS)
+        return find_candidates(
+            objective, self.limbs, self.starts, self.keypoint_solver, _KEYPOINT_STEPS
+        )
+
+
+def make_setup(
+    body: BodyModel,
+    camera: PinholeCamera,
+    count: int,
+    *,
+    joints: Any,
+    people: int,
+    regulariser: Any,
+    search: bool,
+    fit_shape: bool,
+    fit_translation: bool,
+    prior: GaussianPosePrior | None,
+    limits: JointLimits | None,
+    weights: dict[str, float],
+    starts: int,
+    solver: Any,
+    keypoint_solver: Any,
+    max_steps: int,
+) -> Setup:
+    """The setup of a call from its arguments.
+
+    Args:
+        count: of keypoints.
+        people: how many share one scene.
+        search: whether starts are looked for, or the one that was given is taken.
+        weights: of prior, limits, shape and upright.
+
+    The others are as `fit_pose` has them.
+
+    Raises:
+        TypeError, ValueError: as `fit_pose`.
+    """
+    if not isinstance(body, BodyModel):
+        raise TypeError(f"body must be a BodyModel: got {type(body).__name__}; see load_body.")
+    if not isinstance(camera, PinholeCamera):
+        raise TypeError(
+            f"camera must be a PinholeCamera: got {type(camera).__name__}; "
+            "PinholeCamera.from_matrix takes a 3 x 4 matrix."
+        )
+    for name, number, least in (("starts", starts, 1), ("max_steps", max_steps, 1)):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}: got {number!r}.")
+    for name, weight in weights.items():
+        if (
+            not isinstance(weight, (int, float, np.integer, np.floating))
+            or not 0 <= weight < np.inf
+        ):
+            raise ValueError(
+                f"{name}_weight must be a finite number, not negative: got {weight!r}."
+            )
+    figure = make_figure(body, keypoint_regressor(body, joints, count=count))
+    return Setup(
+        body=body,
+        figure=figure,
+        camera=camera,
+        prior=prior and prior.of_joints(figure.moving),
+        limits=limits and limits.of_joints(figure.moving),
+        weights=Weights(**{name: jnp.asarray(float(w)) for name, w in weights.items()}),
+        regulariser=as_regulariser(regulariser).prepared(body, people),
+        keypoint_solver=keypoint_solver or optx.BFGS(rtol=1e-4, atol=1e-4),
+        solver=solver or optx.BFGS(rtol=1e-3, atol=1e-3),
+        limbs=limbs_of(figure.body),
+        starts=int(starts) if search else 0,
+        max_steps=int(max_steps),
+        fit_shape=bool(fit_shape),
+        fit_translation=bool(fit_translation),
+    )
+
+
+def as_prior(body: BodyModel, prior: Any) -> GaussianPosePrior | None:
+    """The prior of an argument; ValueError for anything else."""
+    if isinstance(prior, str) and prior == "mocap":
+        return pose_prior(body.joint_names)
+    if prior is None or isinstance(prior, GaussianPosePrior):
+        return prior
+    raise ValueError(f'prior must be "mocap", a GaussianPosePrior or None: got {prior!r}.')
+
+
+def as_limits(body: BodyModel, limits: Any) -> JointLimits | None:
+    """The limits of an argument; ValueError for anything else."""
+    if isinstance(limits, str) and limits == "anatomical":
+        return joint_limits(body.joint_names)
+    if limits is None or isinstance(limits, JointLimits):
+        return limits
+    raise ValueError(f'limits must be "anatomical", JointLimits or None: got {limits!r}.')

@@ -1,0 +1,354 @@
+"""A body approximated by spheres, the paper's rival "RE + SA", and how far they collide."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from spt_jax.body import BodyModel
+from spt_jax.body.rotations import matrix_from_axis_angle
+from spt_jax.body.skinning import blend_shapes, forward_kinematics, lift
+from spt_jax.fit.sphere_fitting import Rest, fit_spheres
+from spt_jax.fit.surface_samples import sample_surface
+
+# Distances at rest round differently from those in a pose; a pair that the shape alone brings
+# together may come this part nearer for nothing.
+_SLACK = 1e-5
+
+
+class PosedSpheres(NamedTuple):
+    """Spheres of a posed body: `centers` (..., S, 3) and `radii` (..., S), in metres."""
+
+    centers: Float[Array, "*batch S 3"]
+    radii: Float[Array, "*batch S"]
+
+
+class Coverage(NamedTuple):
+    """How well spheres fill a body, as parts of its volume.
+
+    Attributes:
+        covered: of the body that lies in some sphere.
+        outside: of the spheres' union that lies outside of the body.
+    """
+
+    covered: float
+    outside: float
+
+
+class BodySpheres(eqx.Module):
+    """Spheres that approximate a body's interior, each carried rigidly by one joint.
+
+    The coarse approximation of Pons-Moll et al. 2015, which the paper compares with; the spheres
+    follow the shape, linearly, and leave out pose blend shapes. Make them with `fit`, once and
+    outside `jit`; they are a pytree.
+
+    Attributes:
+        centers: at rest, of the mean shape, in metres.
+        center_shape_basis: displacement of each centre for one unit of each shape coefficient.
+        radii: of the mean shape, in metres.
+        radius_shape_basis: change of each radius likewise.
+        counts: which pairs may collide; true above the diagonal only. Left out are spheres of one
+            part, of parent and child, those that overlap at rest in the mean shape, and those
+            nearer to each other along the limbs than the fold distance.
+        part: the joint that carries each sphere.
+
+    Example:
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit.spheres import BodySpheres
+        >>> spheres = BodySpheres.fit(load_body())
+        >>> len(spheres.part)
+        104
+    """
+
+    centers: Float[Array, "S 3"]
+    center_shape_basis: Float[Array, "S 3 B"]
+    radii: Float[Array, "S"]
+    radius_shape_basis: Float[Array, "S B"]
+    counts: Bool[Array, "S S"]
+    part: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def fit(
+        cls, body: BodyModel, *, share: float = 0.9, fold_distance: float = 0.3
+    ) -> "BodySpheres":
+        """Spheres for any body, from its rest surface and its parts (`body.part_groups`) alone.
+
+        Part by part, the sphere that covers most of the part's volume not covered yet, less what
+        it covers outside of the body, until `share` is covered or a sphere would add less than
+        4 % of the part or 0.02 % of the body. Fitted in 0.8 s on one core and kept: another call
+        with the same body takes 5 ms. The embedded body gets 104 spheres, 30 of them in the
+        fingers; they hold 83 % of its volume, and another 8 % lies in them outside of it
+        (`coverage`); their surface is 9 mm from the skin on average.
+
+        Args:
+            body: any `BodyModel` whose surface encloses a volume.
+            share: of each part's volume to cover, above 0 and at most 1.
+            fold_distance: in metres. Spheres nearer than this along the limbs, over the joints
+                between them, come together whenever a joint bends: the rule for folds of
+                `body.rest_surface`, here for spheres. Without it 98 % of the collision-free mocap
+                frames collide, thigh with belly above all.
+
+        Raises:
+            TypeError: the body is traced.
+            ValueError: a share or distance out of range; a body without an inside.
+        """
+        if isinstance(body.template, Tracer):
+            raise TypeError(
+                "body must be known: got a traced one; fit the spheres outside jit, vmap and grad, "
+                "and pass them in."
+            )
+        if not 0 < share <= 1:
+            raise ValueError(f"share must be above 0 and at most 1: got {share!r}.")
+        if not 0 <= fold_distance < np.inf:
+            raise ValueError(
+                f"fold_distance must be finite and not negative: got {fold_distance!r}."
+            )
+        found = fit_spheres(
+            Rest(
+                vertices=np.asarray(body.template, np.float64),
+                faces=np.asarray(body.faces, np.int64),
+                groups=np.asarray(body.part_groups, np.int64),
+                joints=np.asarray(body.joint_template, np.float64),
+                parents=body.parents,
+                shape_basis=np.asarray(body.shape_basis, np.float64),
+                share=float(share),
+                fold_distance=float(fold_distance),
+            )
+        )
+        if not len(found.part):
+            raise ValueError(
+                "body must enclose a volume: got no point inside; check_mesh(body.template, "
+                "body.faces) tells what is wrong with the surface."
+            )
+        dtype = body.template.dtype
+        return cls(
+            centers=jnp.asarray(found.centers, dtype),
+            center_shape_basis=jnp.asarray(found.center_shape_basis, dtype),
+            radii=jnp.asarray(found.radii, dtype),
+            radius_shape_basis=jnp.asarray(found.radius_shape_basis, dtype),
+            counts=jnp.asarray(found.counts),
+            part=tuple(found.part.tolist()),
+        )
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "P 2"]:
+        """The pairs of spheres that may collide, outside `jit`."""
+        return np.argwhere(np.asarray(self.counts))
+
+    def posed(
+        self,
+        body: BodyModel,
+        pose: Float[Array | np.ndarray, "*#batch J 3"],
+        shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
+        translation: Float[Array | np.ndarray, "*#batch 3"] | None = None,
+    ) -> PosedSpheres:
+        """The spheres of the body in a pose; no vertex is skinned.
+
+        Args:
+            body: the body that they were fitted to.
+            pose, shape, translation: as the body takes them.
+
+        Returns:
+            PosedSpheres(centers, radii), in the dtype of `pose`.
+
+        Raises:
+            TypeError, ValueError: as the body does.
+
+        Differentiation: every mode, with respect to the arguments and to the arrays of both.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from spt_jax import load_body
+            >>> from spt_jax.fit.spheres import BodySpheres
+            >>> body = load_body()
+            >>> BodySpheres.fit(body).posed(body, jnp.zeros((8, 52, 3))).centers.shape
+            (8, 104, 3)
+        """
+        angles, betas = _arguments(body, pose, shape)
+        shift = jnp.zeros(3) if translation is None else jnp.asarray(translation)
+        if shift.ndim < 1 or shift.shape[-1] != 3:
+            raise ValueError(f"translation must be (..., 3): got shape {shift.shape}.")
+        shift = shift.astype(angles.dtype)
+        centers, radii = _posed(self, _Tree(body), angles, betas)
+        rank = max(centers.ndim - 2, shift.ndim - 1)
+        centers = lift(centers, rank, 2) + lift(shift, rank, 1)[..., None, :]
+        return PosedSpheres(centers, jnp.broadcast_to(lift(radii, rank, 1), centers.shape[:-1]))
+
+    def coverage(
+        self, body: BodyModel, shape: Float[Array | np.ndarray, "B"] | None = None
+    ) -> Coverage:
+        """How well the spheres fill the body at rest, by 200,000 samples, outside `jit`.
+
+        Args:
+            body: the body that they were fitted to.
+            shape: coefficients, the mean where None.
+
+        Example:
+            >>> from spt_jax import load_body
+            >>> from spt_jax.fit.spheres import BodySpheres
+            >>> body = load_body()
+            >>> covered, outside = BodySpheres.fit(body).coverage(body)
+            >>> bool(covered > 0.8 > 0.1 > outside)
+            True
+        """
+        vertices = np.asarray(body.rest(shape), np.float64)
+        pose = jnp.zeros((body.num_joints, 3), body.template.dtype)
+        centers, radii = (np.asarray(x, np.float64) for x in self.posed(body, pose, shape))
+        low = np.minimum(vertices.min(axis=0), (centers - radii[:, None]).min(axis=0))
+        high = np.maximum(vertices.max(axis=0), (centers + radii[:, None]).max(axis=0))
+        points = np.random.default_rng(0).uniform(low, high, (200_000, 3))
+        inside, _ = sample_surface(vertices, np.asarray(body.faces, np.int64)).inside(points)
+        held = np.zeros(len(points), bool)
+        for center, radius in zip(centers, radii, strict=True):
+            held |= ((points - center) ** 2).sum(axis=1) < radius**2
+        volume = max(int(inside.sum()), 1)
+        return Coverage(
+            float((held & inside).sum() / volume), float((held & ~inside).sum() / volume)
+        )
+
+
+def sphere_penalty(
+    spheres: BodySpheres,
+    body: BodyModel,
+    pose: Float[Array | np.ndarray, "*#batch J 3"],
+    shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
+    translation: Float[Array | np.ndarray, "*#batch 3"] | None = None,
+) -> Float[Array, "*batch"]:
+    """How far the spheres of a posed body collide, as a loss.
+
+    The sum over pairs (i, j) that may collide of max(0, reach - |c_i - c_j|)^2, the squared depth,
+    with reach = r_i + r_j, or the centres' distance at rest where the shape alone already brings
+    the spheres together. So it is zero in the zero pose, for every shape. The paper says only
+    "the intersection between spheres"; SMPLify's capsules are turned into Gaussians
+    exp(-d^2 / (s_i^2 + s_j^2)), which push parts that do not touch. The depth is zero there and,
+    unlike the volume of the lens, does not lose its force when spheres barely touch or when one
+    is inside the other.
+
+    Args:
+        spheres: fitted to the body.
+        body, pose, shape: as in `BodySpheres.posed`; the global orientation changes nothing.
+        translation: of the body; it changes nothing, and is taken so that terms are called alike.
+
+    Returns:
+        One number per body, in m^2, in the dtype of `pose`.
+
+    Raises:
+        TypeError, ValueError: as the body does.
+
+    Differentiation: every mode; finite everywhere, zero between spheres that share their centre.
+        Once differentiable in all, twice but where spheres begin to touch.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import load_body, load_mocap
+        >>> from spt_jax.fit.spheres import BodySpheres, sphere_penalty
+        >>> body, mocap = load_body(), load_mocap()
+        >>> spheres = BodySpheres.fit(body)
+        >>> crawl = body.pose_from_smpl(mocap.pose[mocap.names.index("crawl/0092")])
+        >>> penalty = sphere_penalty(spheres, body, jnp.stack([crawl, 0 * crawl]))
+        >>> bool(penalty[0] > 1e-3), float(penalty[1])
+        (True, 0.0)
+    """
+    angles, betas = _arguments(body, pose, shape)
+    return jnp.sum(_depths(spheres, _Tree(body), angles, betas) ** 2, axis=(-2, -1))
+
+
+def sphere_depths(
+    spheres: BodySpheres,
+    body: BodyModel,
+    pose: Float[Array | np.ndarray, "*#batch J 3"],
+    shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
+) -> Float[Array, "*batch S S"]:
+    """How deep each pair of spheres collides, in metres: what `sphere_penalty` squares and sums.
+
+    Args:
+        spheres, body, pose, shape: as in `sphere_penalty`.
+
+    Returns:
+        Depths above the diagonal; zero where a pair does not collide or does not count.
+
+    Raises:
+        TypeError, ValueError: as the body does.
+
+    Differentiation: as `sphere_penalty`; one-sided where spheres begin to touch.
+    """
+    angles, betas = _arguments(body, pose, shape)
+    return _depths(spheres, _Tree(body), angles, betas)
+
+
+class _Tree(eqx.Module):
+    """The joints of a body: all that its spheres need, so that jit is not handed its surface."""
+
+    joints: Float[Array, "J 3"]
+    basis: Float[Array, "J 3 B"]
+    parents: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, body: BodyModel):
+        self.joints, self.basis = body.joint_template, body.joint_shape_basis
+        self.parents = body.parents
+
+
+@jax.jit
+def _posed(spheres: BodySpheres, tree: _Tree, angles, betas):
+    dtype = angles.dtype
+    rank = max(angles.ndim - 2, 0 if betas is None else betas.ndim - 1)
+    joints, centers, radii = _at_rest(spheres, tree, betas, dtype)
+    rotations = lift(matrix_from_axis_angle(angles), rank, 3)
+    joints, centers, radii = lift(joints, rank, 2), lift(centers, rank, 2), lift(radii, rank, 1)
+    world, positions = forward_kinematics(rotations, joints, tree.parents)
+    part = np.array(spheres.part)
+    arm = (centers - joints[..., part, :])[..., None, :]
+    turned = jnp.sum(world[..., part, :, :] * arm, axis=-1)
+    return positions[..., part, :] + turned, radii
+
+
+@jax.jit
+def _depths(spheres: BodySpheres, tree: _Tree, angles, betas):
+    centers, radii = _posed(spheres, tree, angles, betas)
+    rank = centers.ndim - 2
+    _, rest, _ = _at_rest(spheres, tree, betas, angles.dtype)
+    # All pairs, not a gather of those that count: the gradient of a gather is a scatter.
+    reach = radii[..., :, None] + radii[..., None, :]
+    reach = jnp.minimum(reach, lift((1 - _SLACK) * _distances(rest), rank, 2))
+    counts = lift(spheres.counts, centers.ndim - 2, 2)
+    return jnp.where(counts, jnp.maximum(reach - _distances(centers), 0.0), 0.0)
+
+
+def _at_rest(spheres: BodySpheres, tree: _Tree, betas, dtype):
+    joints = blend_shapes(tree.joints, tree.basis, betas, dtype)
+    centers = blend_shapes(spheres.centers, spheres.center_shape_basis, betas, dtype)
+    radii = blend_shapes(spheres.radii[:, None], spheres.radius_shape_basis[:, None], betas, dtype)
+    return joints, centers, jnp.maximum(radii[..., 0], 0.0)
+
+
+def _distances(points):
+    """Between all pairs; where two coincide zero, with a derivative of zero."""
+    square = jnp.sum((points[..., :, None, :] - points[..., None, :, :]) ** 2, axis=-1)
+    apart = square > 0
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
+
+
+def _arguments(body: BodyModel, pose, shape):
+    angles = jnp.asarray(pose)
+    if not jnp.issubdtype(angles.dtype, jnp.floating):
+        raise TypeError(f"pose must be floating-point: got dtype {angles.dtype}.")
+    if angles.ndim < 2 or angles.shape[-2:] != (body.num_joints, 3):
+        raise ValueError(
+            f"pose must be (..., {body.num_joints}, 3), one axis-angle row a joint: got shape "
+            f"{angles.shape}; for SMPL's layouts use body.pose_from_smpl(pose)."
+        )
+    if shape is None:
+        return angles, None
+    betas = jnp.asarray(shape)
+    if not jnp.issubdtype(betas.dtype, jnp.floating):
+        raise TypeError(f"shape must be floating-point: got dtype {betas.dtype}.")
+    if betas.ndim < 1 or betas.shape[-1] > body.num_shape:
+        raise ValueError(
+            f"shape must have at most {body.num_shape} coefficients in its last axis: got shape "
+            f"{betas.shape}; drop the last ones."
+        )
+    return angles, betas.astype(angles.dtype)

@@ -1,0 +1,120 @@
+"""Where a fit starts: turned and placed so that the resting body looks like the keypoints."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from spt_jax.fit.figure import Variables
+from spt_jax.fit.objective import Objective
+
+# Directions from which the body is looked at, evenly over the sphere (24 degrees apart); what is
+# between them is left to the solver.
+_NUM_VIEWS = 64
+
+# Keypoints of the trunk keep their distances; how far the others move away from where the mean
+# pose has them is not known, and a seventh of the weight is enough to tell up from down.
+_TRUNK = ("pelvis", "hip", "spine1", "spine2", "spine3", "neck", "collar", "shoulder")
+_LIMB_WEIGHT = 0.15
+
+# Against the unexplained share of the keypoints' spread: a body upside down costs 0.06, one that
+# shows its back 0.002. Only where the keypoints leave it open do they decide.
+_UPRIGHT, _FACING = 0.03, 0.001
+
+# Starts are at least this far apart, in degrees.
+_APART = 50.0
+
+# A body nearer than 0.5 m or farther than 200 m is a misunderstanding; one point alone has no
+# size, and then the body stands 4 m away.
+_NEAREST, _FARTHEST, _USUAL = 0.5, 200.0, 4.0
+
+
+def orientation_starts(objective: Objective, count: int) -> Float[Array, "count D"]:
+    """The variables of `count` starts, the most likely first.
+
+    The body at rest is looked at from all sides; for each side the rotation in the image, the size
+    and the place that bring it nearest to the keypoints are a linear problem in complex numbers.
+    The sides that leave the least unexplained are taken, each far enough from those before it. The
+    two mirror images that a flat trunk has under a distant camera are thus both among them.
+
+    Args:
+        objective: of one person; what it holds fixed is kept.
+        count: how many.
+    """
+    camera = objective.camera
+    dtype = objective.keypoints.dtype
+    base = objective.start
+    rest = base.pose[objective.figure.rows].at[0].set(0.0)
+    origin = Variables(rest, base.shape, jnp.zeros(3, dtype))
+    points, joints = objective.figure.points_and_joints(origin)
+    weights = objective.confidence * jnp.asarray(_trunk_weights(objective.names), dtype)
+    total = jnp.maximum(jnp.sum(weights), jnp.finfo(dtype).tiny)
+    image = (objective.keypoints - camera.center) / camera.focal
+    image_centre = jnp.sum(weights[:, None] * image, axis=0) / total
+    centre = jnp.sum(weights[:, None] * points, axis=0) / total
+    views = jnp.asarray(_views(_NUM_VIEWS), dtype)
+
+    target = _as_complex(image - image_centre)
+    seen = _as_complex(jnp.einsum("vij,kj->vki", views, points - centre))
+    overlap = jnp.sum(weights * jnp.conj(seen) * target, axis=-1)
+    size = jnp.sum(weights * jnp.abs(seen) ** 2, axis=-1)
+    spread = jnp.sum(weights * jnp.abs(target) ** 2)
+    told = (size > 1e-6 * total) & (spread > 1e-12 * total)
+    scale = jnp.where(told, overlap / jnp.where(told, size, 1.0), 1.0 / _USUAL)
+    explained = jnp.where(told, jnp.abs(overlap) ** 2 / jnp.where(told, size, 1.0), 0.0)
+    unexplained = 1 - explained / jnp.where(spread > 0, spread, 1.0)
+    turned = _in_image(jnp.angle(scale)) @ views
+    # The body's up against the image's, and whether it faces the camera.
+    score = unexplained + _UPRIGHT * (1 + turned[:, 1, 1]) + _FACING * (1 + turned[:, 2, 2])
+    chosen = _spread_out(score, turned, count)
+
+    distance = jnp.clip(1 / jnp.abs(scale[chosen]), _NEAREST, _FARTHEST)
+    at = jnp.concatenate([image_centre, jnp.ones(1, dtype)]) * distance[:, None]
+    root = camera.rotation.astype(dtype).T @ turned[chosen]
+    world = (at - camera.translation.astype(dtype)) @ camera.rotation.astype(dtype)
+    moved = world - (jnp.einsum("sij,j->si", root, centre - joints[0]) + joints[0])
+
+    def packed(root, moved):
+        pose = rest.at[0].set(axis_angle_from_matrix(root))
+        return objective.repacked(Variables(pose, base.shape, moved))
+
+    return jax.vmap(packed)(root, moved)
+
+
+def _trunk_weights(names: tuple[str, ...]) -> list[float]:
+    bare = [name.removeprefix("left_").removeprefix("right_") for name in names]
+    return [1.0 if name in _TRUNK else _LIMB_WEIGHT for name in bare]
+
+
+def _as_complex(points: Float[Array, "*batch axes"]) -> Complex[Array, "*batch"]:
+    return jax.lax.complex(points[..., 0], points[..., 1])
+
+
+def _in_image(angle: Float[Array, "N"]) -> Float[Array, "N 3 3"]:
+    axis = jnp.zeros((*angle.shape, 3), angle.dtype).at[..., 2].set(angle)
+    return matrix_from_axis_angle(axis)
+
+
+def _views(count: int) -> Float[np.ndarray, "N 3 3"]:
+    """Rotations from the body to cameras all around it: rows right, down and forward."""
+    # A spiral of equal areas; the golden angle keeps neighbouring turns apart.
+    k = np.arange(count) + 0.5
+    height = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - height**2)
+    forward = np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], axis=1)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def _spread_out(score: Float[Array, "N"], rotations: Float[Array, "N 3 3"], count: int) -> Array:
+    chosen = []
+    for _ in range(count):
+        best = jnp.argmin(score)
+        chosen.append(best)
+        cosine = (jnp.einsum("ij,nij->n", rotations[best], rotations) - 1) / 2
+        # Where all that is left is near, the least bad is taken.
+        score = jnp.where(cosine > np.cos(np.radians(_APART)), score + 10.0, score)
+    return jnp.stack(chosen)
