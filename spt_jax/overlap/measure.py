@@ -24,7 +24,6 @@ from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
 from spt_jax.overlap.triangles import closed_form
 from spt_jax.overlap.triangles.closed_form import ClosedForm
 from spt_jax.overlap.triangles.sheets import Map, Sheets, find_sheets
-from spt_jax.overlap.triangles.vertex_winding import vertex_winding
 
 Directions = tuple[tuple[float, float, float], ...]
 Value = Literal["volume", "ratio"]
@@ -82,7 +81,7 @@ class Measurement:
     def sheets(self) -> Sheets:
         """The triangles that bound overlaps, found without beams."""
         directions = np.array(self.sampling.directions)
-        return find_sheets(self.vertices, self.faces, directions, self.map_tasks)
+        return find_sheets(self.vertices, self.faces, directions)
 
     @cached_property
     def closed_form(self) -> ClosedForm | None:
@@ -189,10 +188,6 @@ class Measurement:
 
         By each vertex itself, or by Algorithm 1's triangle rule over all beams.
         """
-        if rule == "vertex" and not self.exclusions.any and "sheets" not in vars(self):
-            directions = np.array(self.sampling.directions)
-            winding = vertex_winding(self.vertices, self.faces, directions)
-            return np.sign(winding).astype(np.int8)
         if rule == "vertex":
             return counted_labels(self.sheets, self.faces, self._counted)
         overlaps = [found.overlaps for found in self.beams]

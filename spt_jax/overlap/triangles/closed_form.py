@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.overlap.boundary import area_normals, summed
+from spt_jax.overlap.boundary import area_normals, cross, summed
 from spt_jax.overlap.triangles.segments import Cusps, crossed_triangles, find_segments
 from spt_jax.overlap.triangles.sheets import Sheets
 
@@ -69,14 +69,14 @@ def solve(
     own, foreign = whole.pair.ravel(), whole.pair[:, ::-1].ravel()
     start, end = (np.repeat(x, 2, axis=0) for x in (whole.start, whole.end))
     # On the left of the segment, seen against the own normal, is the foreign solid's inside?
-    left = np.cross(normals[row[own]], end - start)
+    left = cross(normals[row[own]], end - start)
     jump = -np.sign(np.einsum("ki,ki->k", left, normals[row[foreign]]))
     cusps = whole.cusps(faces, row, own, jump)
     sums, sound, deep = _sides(vertices, faces, sheets, row, cusps)
     start, end = (
         _coordinates(vertices, corners[row[own]], normals[row[own]], x) for x in (start, end)
     )
-    np.add.at(sums, row[own], jump[:, None] * _along(start, end))
+    sums += summed(row[own], jump[:, None] * _along(start, end), len(found))
     deep |= crossed_triangles(row[own], start, end, len(found))
     sound &= (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
     sound[row[segments.pair[~segments.whole]]] = False
@@ -159,8 +159,8 @@ def _coordinates(vertices, corners, normals, point) -> Float[np.ndarray, "K 2"]:
     """(u, v) of points on triangles: their barycentric coordinates at corners 1 and 2."""
     a, b, c = (vertices[corners[:, k]] for k in range(3))
     square = np.maximum(np.einsum("ki,ki->k", normals, normals), np.finfo(float).tiny)
-    u = np.einsum("ki,ki->k", normals, np.cross(point - a, c - a)) / square
-    v = np.einsum("ki,ki->k", normals, np.cross(b - a, point - a)) / square
+    u = np.einsum("ki,ki->k", normals, cross(point - a, c - a)) / square
+    v = np.einsum("ki,ki->k", normals, cross(b - a, point - a)) / square
     return np.stack([u, v], axis=1)
 
 
@@ -203,7 +203,7 @@ def _sides(vertices, faces, sheets: Sheets, row, cusps: Cusps):
     begins, known = _at_starts(start, end, np.bincount(side, jump, len(start)), sheets, cusps)
     at = side_start[side] + part[:, None] * (side_end - side_start)[side]
     sums = begins[:, None] * _along(side_start, side_end)
-    np.add.at(sums, side, jump[:, None] * _along(at, side_end[side]))
+    sums += summed(side, jump[:, None] * _along(at, side_end[side]), len(start))
     sums = sums.reshape(count, 3, 5).sum(axis=1)
 
     # The winding number after each jump; before the first it is that of the corner.

@@ -18,9 +18,12 @@ _CHUNK = 1 << 16
 # A coordinate of a box takes 20 bits and a guard bit, three to a word: two subtractions of words
 # do the six comparisons of two boxes, and a pair gathers four numbers instead of twelve.
 _FIELD = 21
-_STEPS = (1 << (_FIELD - 1)) - 1
+_STEPS = (1 << (_FIELD - 1)) - 2
 _GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
 _BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
+# As `vertex_winding._THINNEST`, of the longest side of the box around the mesh, which no screen
+# sees longer than twice this.
+_CONTACT = 2e-7
 _Pairs = list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -36,15 +39,20 @@ class _Boxes:
 
 @dataclass(frozen=True)
 class Shape:
-    """The triangles in their slots: corners, area normals, boxes as whole numbers and as words."""
+    """The triangles in their slots: corners, area normals, boxes as whole numbers and as words.
+
+    Nearer than `contact` is on the same spot, as in `vertex_winding`.
+    """
 
     corner: Float[np.ndarray, "3 3 S"]  # axis, corner, slot
     normal: Float[np.ndarray, "3 S"]
+    length: Float[np.ndarray, "S"]  # of the normal
     extent: Float[np.ndarray, "S"]
     low: Int[np.ndarray, "3 S"]
     high: Int[np.ndarray, "3 S"]
     low_word: Int[np.ndarray, "S"]
     high_word: Int[np.ndarray, "S"]
+    contact: float
 
 
 def _face_boxes(points, faces):
@@ -63,12 +71,15 @@ def _shape(points, layout: Layout) -> Shape:
     base = low.min(axis=1, keepdims=True)
     span = float((high - base).max())
     scale = _STEPS / span if span > 0 else 0.0
-    # Rounding down keeps the order of any two coordinates, so boxes that meet still do.
+    # Rounding down keeps the order of any two coordinates, so boxes that meet still do; one more
+    # step, and so do boxes that are apart by rounding.
     low = ((low - base) * scale).astype(np.int64)
-    high = ((high - base) * scale).astype(np.int64)
-    low[:, layout.empty] = _STEPS
+    high = ((high - base) * scale).astype(np.int64) + 1
+    low[:, layout.empty] = _STEPS + 1
     high[:, layout.empty] = 0
-    return Shape(corner, normal, extent, low, high, _word(low), _word(high) | _GUARDS)
+    length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    words = _word(low), _word(high) | _GUARDS
+    return Shape(corner, normal, length, extent, low, high, *words, _CONTACT * span)
 
 
 def near_groups(mesh: Prepared, points):
@@ -161,22 +172,20 @@ def _meeting_members(low, high, a, b):
 
 def _meeting_triangles(layout: Layout, shape: Shape, boxes: _Boxes, a, b):
     """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
+    low, high = (word.reshape(-1, CLUSTER) for word in (shape.low_word, shape.high_word))
     for part in parts(np.full(len(a), 3 * CLUSTER)):
-        pair_t, t = _reaching(shape, boxes, a[part], b[part])
-        pair_u, u = _reaching(shape, boxes, b[part], a[part])
-        count = np.bincount(pair_u, minlength=len(a[part]))
-        first = (np.cumsum(count) - count).take(pair_t)
-        count = count.take(pair_t)
-        # take, not an index: half the time.
-        low_t, high_t = shape.low_word.take(t), shape.high_word.take(t)
-        low_u, high_u = shape.low_word.take(u), shape.high_word.take(u)
-        for piece in parts(count):
-            second, at = spread(first[piece], count[piece])
-            at += piece.start
-            kept = np.flatnonzero(
-                _meet(low_t.take(at), high_t.take(at), low_u.take(second), high_u.take(second))
-            )
-            yield _sharing_none(layout, t.take(at.take(kept)), u.take(second.take(kept)))
+        pair, t = _reaching(shape, boxes, a[part], b[part])
+        # Against all of the other cluster at once: only those that reach back are fewer, but to
+        # look each of them up takes a third longer.
+        other = b[part].take(pair)
+        for piece in parts(np.full(len(t), CLUSTER)):
+            u, first = other[piece], t[piece]
+            low_t, high_t = shape.low_word.take(first), shape.high_word.take(first)
+            meet = _meet(low_t[:, None], high_t[:, None], low.take(u, axis=0), high.take(u, axis=0))
+            found = np.flatnonzero(meet)
+            at = found // CLUSTER
+            second = CLUSTER * u.take(at) + found % CLUSTER
+            yield _sharing_none(layout, first.take(at), second)
 
 
 def _reaching(shape: Shape, boxes: _Boxes, a, b):

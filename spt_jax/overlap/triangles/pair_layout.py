@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 from jaxtyping import Bool, Float, Int
 
 # Triangles to a cluster, and clusters to a group. On the posed body 4 make 33,000 pairs of clusters
@@ -29,6 +30,10 @@ class Topology:
             the first of that row, else -1: every row is tested once, from its first face.
         closed: vertices whose triangles surround them: each edge there has two triangles,
             which run along it in opposite senses.
+        used: vertices of any triangle.
+        simple: vertices whose triangles hang together by edges there, not in several fans.
+        neighbours: (V, V), has an entry for each edge in both directions.
+        entries: the places of each row's two directions in its data and indices.
         fan_start, fan: the corners (3 face + corner) at each vertex v are
             fan[fan_start[v] : fan_start[v + 1]].
     """
@@ -39,6 +44,10 @@ class Topology:
     edge_id: Int[np.ndarray, "R"]
     opposite: Int[np.ndarray, "F 3"]
     closed: Bool[np.ndarray, "V"]
+    used: Bool[np.ndarray, "V"]
+    simple: Bool[np.ndarray, "V"]
+    neighbours: scipy.sparse.csr_array
+    entries: Int[np.ndarray, "R 2"]
     fan_start: Int[np.ndarray, "V1"]
     fan: Int[np.ndarray, "F3"]
 
@@ -97,10 +106,13 @@ def prepared(faces: Int[np.ndarray, "F 3"], count: int) -> Prepared:
     with _lock:
         for key, mesh in reversed(_meshes.items()):
             known = mesh.topology
-            if len(known.closed) == count and np.array_equal(known.faces, faces):
+            same = faces is known.faces or np.array_equal(known.faces, faces)
+            if same and len(known.closed) == count:
                 _meshes.move_to_end(key)
                 return mesh
-    mesh = Prepared(_topology(faces.astype(np.int64), count))
+    # Faces that nobody may write to, such as those from `host.py`, are known again as they are.
+    kept = faces.astype(np.int64, copy=faces.flags.writeable)
+    mesh = Prepared(_topology(kept, count))
     with _lock:
         _meshes[_next_key] = mesh
         _next_key += 1
@@ -127,20 +139,54 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     use = np.bincount(edge_id)
     sense = np.bincount(edge_id, np.where(tail < head, 1, -1)[half])
     ragged = ((use != 2) | (sense != 0))[edge_id]
-    closed = np.bincount(faces.ravel(), minlength=count) > 0
+    used = np.bincount(faces.ravel(), minlength=count) > 0
+    closed = used.copy()
     closed[low[ragged]] = False
     closed[high[ragged]] = False
     fan = np.argsort(faces.ravel(), kind="stable")
+    ends = np.stack([low[first], high[first]], axis=1)
+    tail, head = np.concatenate([ends, ends[:, ::-1]]).T
+    order = np.lexsort((head, tail))
+    entries = np.empty(len(order), np.int64)
+    entries[order] = np.arange(len(order))
+    degree = np.bincount(tail, minlength=count)
+    neighbours = scipy.sparse.csr_array(
+        (np.ones(len(order)), head[order], np.append(0, np.cumsum(degree))), shape=(count, count)
+    )
     return Topology(
         faces=faces,
-        ends=np.stack([low[first], high[first]], axis=1),
+        ends=ends,
         edge_faces=np.stack([half[first] // 3, np.where(paired, half[second] // 3, -1)], axis=1),
         edge_id=edge_id[first],
         opposite=opposite.reshape(faces.shape),
         closed=closed,
+        used=used,
+        simple=_simple(faces, half[first[paired]], half[second[paired]], count),
+        neighbours=neighbours,
+        entries=entries.reshape(2, -1).T,
         fan_start=np.append(0, np.cumsum(np.bincount(faces.ravel(), minlength=count))),
         fan=fan,
     )
+
+
+def _simple(faces, one, other, count: int) -> Bool[np.ndarray, "V"]:
+    """Vertices whose corners are connected over edges, given the two half-edges of each."""
+    links = []
+    for turn in (1, 2):
+        # Half-edge 3 face + k has its ends in the corners k + 1 and k + 2, in one face in this
+        # order and in the other face against it.
+        (a, k), (b, m) = np.divmod(one, 3), np.divmod(other, 3)
+        corner = 3 * a + (k + turn) % 3
+        there = np.where(faces[b, (m + 1) % 3] == faces[a, (k + turn) % 3], 1, 2)
+        links.append(np.stack([corner, 3 * b + (m + there) % 3]))
+    first, second = np.concatenate(links, axis=1)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(first), np.int8), (first, second)), shape=(faces.size, faces.size)
+    )
+    fan = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    vertex = np.empty(fan.max(initial=-1) + 1, np.int64)
+    vertex[fan] = faces.ravel()
+    return np.bincount(vertex, minlength=count) <= 1
 
 
 def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layout:

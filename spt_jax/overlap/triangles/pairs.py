@@ -22,9 +22,7 @@ from spt_jax.overlap.triangles.pair_boxes import (
     spread,
 )
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
-
-# Relative to the size of what is multiplied, far above float64's rounding.
-_ROUNDING = 1e-14
+from spt_jax.overlap.triangles.pair_planes import ROUNDING, dot, not_apart, straddles
 
 
 @dataclass(frozen=True)
@@ -37,12 +35,14 @@ class EdgeCrossings:
             two triangles is listed once for every two of them.
         face: the triangle that the edge passes through.
         point: where it does.
+        touching: vertices that lie on a triangle which is not theirs, but for rounding.
     """
 
     edge: Int[np.ndarray, "K 2"]
     edge_faces: Int[np.ndarray, "K 2"]
     face: Int[np.ndarray, "K"]
     point: Float[np.ndarray, "K 3"]
+    touching: Int[np.ndarray, "T"]
 
 
 def edge_crossings(
@@ -86,7 +86,7 @@ def edge_crossings(
     nothing = np.zeros(0, np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         pairs = np.zeros((0, 2), np.int64)
-        return EdgeCrossings(pairs, pairs, nothing, np.zeros((0, 3)))
+        return EdgeCrossings(pairs, pairs, nothing, np.zeros((0, 3)), nothing)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise IndexError(
             f"faces must index into vertices: got indices {faces.min()} to {faces.max()} for "
@@ -100,8 +100,11 @@ def edge_crossings(
     touching = None if among is None else _touching(topology, among)
     layout, shape, clusters, groups = near_groups(mesh, points)
     found = list(_around_vertices(points, topology, layout, shape))
+    contacts = []
     for t, u in near_pairs(layout, shape, clusters, groups, touching):
-        found.append(_edges_of_pairs(topology, layout, shape, t, u))
+        t, u, contact = not_apart(layout, shape, t, u)
+        contacts.append(contact)
+        found.append(_edges_of_pairs(topology, layout, t, u))
     row, slot = concatenate(found) if found else (nothing, nothing)
     row, face, part = _decide(points, topology, layout, row, slot)
     if among is not None:
@@ -111,7 +114,9 @@ def edge_crossings(
     row, face, part = row[order], face[order], part[order]
     ends = topology.ends[row]
     p, q = np.float64(vertices[ends[:, 0]]), np.float64(vertices[ends[:, 1]])
-    return EdgeCrossings(ends, topology.edge_faces[row], face, p + part[:, None] * (q - p))
+    point = p + part[:, None] * (q - p)
+    contacts = np.unique(np.concatenate(contacts)) if contacts else nothing
+    return EdgeCrossings(ends, topology.edge_faces[row], face, point, contacts)
 
 
 def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
@@ -135,8 +140,11 @@ def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
     of_edge = crossings.edge_faces.ravel()
     through = np.repeat(crossings.face, 2)
     kept = of_edge >= 0
-    pair = np.stack([of_edge[kept], through[kept]], axis=1)
-    return np.unique(np.sort(pair, axis=1), axis=0)
+    of_edge, through = of_edge[kept], through[kept]
+    low, high = np.minimum(of_edge, through), np.maximum(of_edge, through)
+    # As single numbers they sort ten times as fast as by rows.
+    count = int(high.max(initial=-1)) + 1
+    return np.stack(np.divmod(np.unique(low * count + high), max(count, 1)), axis=1)
 
 
 def _edges_of(topology: Topology, among):
@@ -171,7 +179,7 @@ def _around_vertices(points, topology: Topology, layout: Layout, shape: Shape):
         edge, slot = edge[kept], layout.slot[face[kept]]
         ends = np.stack([points.take(x, axis=1) for x in topology.ends[edge].T], axis=1)
         extent = shape.extent[layout.slot[topology.edge_faces[edge, 0]]]
-        kept = np.flatnonzero(_straddles(shape, ends, extent, slot))
+        kept = np.flatnonzero(straddles(shape, ends, extent, slot))
         yield edge[kept], slot[kept]
 
 
@@ -201,7 +209,7 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: Shape):
     facing = at[0] * shape.normal[0]
     facing += at[1] * shape.normal[1]
     facing += at[2] * shape.normal[2]
-    away = facing <= _ROUNDING * shape.extent * shape.extent
+    away = facing <= ROUNDING * shape.extent * shape.extent
     away[:, layout.empty] = False
     medians = np.stack([_medians(x, layout, count) for x in shape.corner])
     sure = topology.closed & (medians[axis, every] == 2)
@@ -219,27 +227,12 @@ def _medians(x, layout: Layout, count):
     return np.bincount(median, minlength=count + 1)[:-1]
 
 
-def _edges_of_pairs(topology: Topology, layout: Layout, shape: Shape, t, u):
-    """Candidates (row, slot) of pairs of triangles that neither's plane keeps apart."""
-    for turn in (0, 1):
-        x, y = (t, u) if turn else (u, t)
-        kept = np.flatnonzero(_straddles(shape, shape.corner.take(x, axis=2), shape.extent[x], y))
-        t, u = t[kept], u[kept]
+def _edges_of_pairs(topology: Topology, layout: Layout, t, u):
+    """Candidates (row, slot) of pairs of triangles."""
     row = topology.opposite.take(layout.face[np.concatenate([t, u])], axis=0).ravel()
     slot = np.repeat(np.concatenate([u, t]), 3)
     kept = np.flatnonzero(row >= 0)
     return row[kept], slot[kept]
-
-
-def _straddles(shape: Shape, points, extent, slot):
-    """Whether points (3, N, M) lie on both sides of the planes of M triangles, or may."""
-    normal, corner = shape.normal.take(slot, axis=1), shape.corner[:, 0].take(slot, axis=1)
-    height = normal[0] * (points[0] - corner[0])
-    height += normal[1] * (points[1] - corner[1])
-    height += normal[2] * (points[2] - corner[2])
-    own = shape.extent[slot]
-    margin = _ROUNDING * own * own * (own + extent)
-    return (height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin)
 
 
 def _decide(points, topology: Topology, layout: Layout, row, slot):
@@ -255,17 +248,13 @@ def _decide(points, topology: Topology, layout: Layout, row, slot):
     a, b, c = (points.take(x, axis=1) for x in corner)
     p, q = (points.take(x, axis=1) for x in ends)
     normal = cross(b - a, c - a)
-    of_p, of_q = _dot(normal, p - a), _dot(normal, q - a)
+    of_p, of_q = dot(normal, p - a), dot(normal, q - a)
     kept = np.flatnonzero((of_p >= 0) != (of_q >= 0))
     row, slot, of_p, of_q = row[kept], slot[kept], of_p[kept], of_q[kept]
     a, b, c, p, q = (x.take(kept, axis=1) for x in (a, b, c, p, q))
     along, to_a, to_b, to_c = q - p, a - p, b - p, c - p
     of_a, of_b = cross(along, to_a), cross(along, to_b)
-    first, second, third = _dot(of_a, to_b) >= 0, _dot(of_b, to_c) >= 0, _dot(of_a, to_c) >= 0
+    first, second, third = dot(of_a, to_b) >= 0, dot(of_b, to_c) >= 0, dot(of_a, to_c) >= 0
     kept = np.flatnonzero((first == second) & (first != third))
     of_p, of_q = of_p[kept], of_q[kept]
     return row[kept], layout.face[slot[kept]], of_p / (of_p - of_q)
-
-
-def _dot(x, y):
-    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]

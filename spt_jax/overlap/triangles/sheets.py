@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from spt_jax.overlap.triangles.pairs import EdgeCrossings, edge_crossings, face_pairs
-from spt_jax.overlap.triangles.vertex_winding import vertex_winding
+from spt_jax.overlap.triangles.patches import winding_by_patches
 
 # map(function, items); the caller may bring one that uses several threads.
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -46,14 +46,10 @@ def find_sheets(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     directions: Float[np.ndarray, "D 3"],
-    map_tasks: Map = map,
 ) -> Sheets:
     """The triangles that bound overlaps, and how they hang together."""
-    tasks = (
-        (lambda: vertex_winding(vertices, faces, directions)),
-        (lambda: edge_crossings(vertices, faces)),
-    )
-    winding, crossings = map_tasks(lambda task: task(), tasks)
+    crossings = edge_crossings(vertices, faces)
+    winding = winding_by_patches(vertices, faces, directions, crossings)
     pairs = face_pairs(crossings)
     bounding = (winding != 0)[faces]
     hot = bounding.any(axis=1)
@@ -77,8 +73,9 @@ def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
     node = np.full(len(faces), -1)
     node[found] = np.arange(len(found))
     first = np.concatenate([row, node[pairs[:, 0]]])
-    second = np.concatenate([len(found) + corners[row, corner], node[pairs[:, 1]]])
-    size = len(found) + len(winding)
+    names, vertex = np.unique(corners[row, corner], return_inverse=True)
+    second = np.concatenate([len(found) + vertex, node[pairs[:, 1]]])
+    size = len(found) + len(names)
     links = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(size, size))
     component = connected_components(links, directed=False)[1][: len(found)]
     used, region[found] = np.unique(component, return_inverse=True)

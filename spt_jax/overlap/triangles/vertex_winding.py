@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.rays.beam import screen_frame
 from spt_jax.overlap.triangles.vertex_cone import within_cone
+from spt_jax.overlap.triangles.vertex_sample import around, used_alone
 
 # The rays lean from the direction that is asked for, by these parts of the screen's axes, and the
 # screen is turned about them: what is modelled has its faces and edges along the axes, and a face
@@ -42,6 +43,10 @@ _STRIPS, _COLUMNS = 1.0, 6.0
 # to the vertices, since each of these turns adds to a sum for every vertex.
 _FACES, _PAIRS = 1 << 12, 1 << 15
 
+# A sample of fewer than this part of the vertices is told from the triangles around it alone:
+# 0.9 ms for a few vertices of a body where all take 18.
+_FEW = 0.1
+
 # Two numbers below 2^31 in one integer, and its bits where a borrow shows that a difference of
 # two such integers is negative in one of its halves: one test for a whole bounding box.
 _HALF = 32
@@ -52,6 +57,7 @@ def vertex_winding(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     directions: Float[np.ndarray, "D 3"],
+    sample: Int[np.ndarray, "S"] | None = None,
 ) -> Int[np.ndarray, "V"]:
     """The winding number just outside the mesh's own surface at every vertex, whatever the depth.
 
@@ -64,22 +70,28 @@ def vertex_winding(
     0: contact is no overlap. Where p's own triangles pass through one another there are more than
     two winding numbers around p, and w_out is one whose successor is among them too; only there
     does it depend on the direction.
+
+    Given a sample of vertices, of which each has triangles, all others are 0.
     """
     winding = np.zeros(len(vertices), np.int64)
     vertices = vertices.astype(np.float64, copy=False)
     undecided = np.zeros(len(vertices), bool)
-    undecided[faces.ravel()] = True
+    undecided[faces.ravel() if sample is None else sample] = True
     with np.errstate(all="ignore"):  # what is not finite compares as false, and counts as 0
         for direction in (*directions, *_SPARE):
             sample = np.flatnonzero(undecided)
             if len(sample) == 0:
                 break
             frame = _generic_frame(direction)
-            own, least, most, total = _sums(frame @ vertices.T, faces, sample)
+            screen = frame @ vertices.T
+            thinnest = _THINNEST * float(np.ptp(screen, axis=1).max())
+            few = len(sample) < _FEW * len(vertices)
+            near = faces[around(screen, faces, sample)] if few else faces
+            own, least, most, total = _sums(*used_alone(screen, near, sample), thinnest)
             least += np.minimum(own, 0)
             most += np.maximum(own, 0) - 1
             grazed = np.flatnonzero(own == 0)
-            within, has_sides = within_cone(vertices, faces, sample[grazed], -frame[2])
+            within, has_sides = within_cone(vertices, near, sample[grazed], -frame[2])
             least[grazed] -= within
             most[grazed] += ~within
             total[grazed[~has_sides]] = 1
@@ -95,10 +107,13 @@ def _generic_frame(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"
 
 
 def _sums(
-    screen: Float[np.ndarray, "3 V"], faces: Int[np.ndarray, "F 3"], sample: Int[np.ndarray, "S"]
+    screen: Float[np.ndarray, "3 V"],
+    faces: Int[np.ndarray, "F 3"],
+    sample: Int[np.ndarray, "S"],
+    thinnest: float,
 ) -> Int[np.ndarray, "4 S"]:
     """O, the least F, the greatest F and F + O + B at each vertex of the sample."""
-    grid = _grid(screen, sample)
+    grid = _grid(screen, sample, thinnest)
     num = len(grid.rank)
     own, least, most, total = sums = np.zeros((4, num))
     at_once = max(_FACES, num // 2)
@@ -139,7 +154,7 @@ class _Grid(NamedTuple):
     thinnest: float
 
 
-def _grid(screen: Float[np.ndarray, "3 V"], sample: Int[np.ndarray, "S"]) -> _Grid:
+def _grid(screen: Float[np.ndarray, "3 V"], sample: Int[np.ndarray, "S"], thinnest: float) -> _Grid:
     num = screen.shape[1]
     order = np.argsort(screen[1])
     rank = np.empty(num, np.int64)
@@ -158,7 +173,6 @@ def _grid(screen: Float[np.ndarray, "3 V"], sample: Int[np.ndarray, "S"]) -> _Gr
     begin = np.zeros(strips * columns + 1, np.int64)
     np.cumsum(np.bincount(cell, minlength=strips * columns), out=begin[1:])
     point = (sampled << _HALF) | place[sampled]
-    thinnest = _THINNEST * float(np.ptp(screen, axis=1).max())
     return _Grid(rank, x, y, z, place, strip, column, columns, point, begin, thinnest)
 
 
