@@ -16,6 +16,7 @@ from spt_jax.fit.inputs import Person
 from spt_jax.fit.objective import Objective, Weights
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
 from spt_jax.fit.regularisers import Regulariser, as_regulariser
+from spt_jax.fit.solver import default_solver
 from spt_jax.keypoints import keypoint_regressor
 
 # Of the fit to the keypoints alone, for each start: two in three need fewer.
@@ -128,8 +129,8 @@ def make_setup(
         limits=limits and limits.of_joints(figure.moving),
         weights=Weights(**{name: jnp.asarray(float(w)) for name, w in weights.items()}),
         regulariser=as_regulariser(regulariser).prepared(body, people),
-        keypoint_solver=keypoint_solver or optx.BFGS(rtol=1e-4, atol=1e-4),
-        solver=solver or optx.BFGS(rtol=1e-3, atol=1e-3),
+        keypoint_solver=keypoint_solver or default_solver(),
+        solver=solver or default_solver(),
         limbs=limbs_of(figure.body),
         starts=int(starts) if search else 0,
         max_steps=int(max_steps),
