@@ -29,6 +29,7 @@ _OUTSIDE, _FAR_OUTSIDE, _NEIGHBOUR = -1.0, 4.0, -0.1
 # gets one sphere, a thigh four.
 _LEAST_OF_PART, _LEAST_OF_BODY = 0.04, 2e-4
 _MOST_SPHERES = 12
+_RADII = 48
 _SWEEPS = 2
 # Which samples of the surface a sphere follows: those nearer to it than this part of its radius.
 _SUPPORT, _FEWEST = 0.25, 30
@@ -91,12 +92,11 @@ class Rest:
 def fit_spheres(rest: Rest) -> Fitted:
     """Spheres that cover the given share of each part, or less where more would be many."""
     surface = sample_surface(rest.vertices, rest.faces)
-    volume = abs(np.einsum("nc,nc,n->", surface.points, surface.normal, surface.area)) / 3
     found = []
     for joint in np.unique(rest.groups[surface.face]).tolist():
         samples = _sample_part(surface, rest, joint)
         if samples is not None:
-            chosen = _cover(samples, rest.share, _LEAST_OF_BODY * volume)
+            chosen = _cover(samples, rest.share, _LEAST_OF_BODY * surface.volume)
             found += [(joint, *sphere) for sphere in chosen]
     part = np.array([sphere[0] for sphere in found], np.int64)
     centers = np.reshape([sphere[1] for sphere in found], (-1, 3)).astype(np.float64)
@@ -169,33 +169,33 @@ def _cover(samples: _Samples, share: float, least: float) -> list[tuple[np.ndarr
     """Centre and radius of each sphere of a part."""
     square = (samples.points**2).sum(axis=1) - 2 * samples.centers @ samples.points.T
     square += (samples.centers**2).sum(axis=1)[:, None]
-    apart = np.sqrt(np.maximum(square, 0.0)).astype(np.float32)
-    # Only as many of the nearest as the largest allowed sphere holds, which halves the work.
-    most = int((apart <= samples.limit[:, None]).sum(axis=1).max()) + 1
-    order = np.argsort(apart, axis=1)[:, :most]
-    reach = np.take_along_axis(apart, order, axis=1)
-    allowed = reach <= samples.limit[:, None]
+    apart = np.sqrt(np.maximum(square, 0.0))
+    # The worth of every radius, of _RADII for each centre, is one running sum of a histogram;
+    # sorting the samples by their distance took twice as long.
+    step = samples.limit / _RADII
+    center, point = np.nonzero(apart < samples.limit[:, None])
+    ring = np.minimum((apart[center, point] / step[center]).astype(np.int64), _RADII - 1)
+    bin_of_pair = center * _RADII + ring
     own = samples.worth > 0
-    target = share * own.sum()
     chosen: list[tuple[int, int]] = []
 
     def covered(spheres) -> Bool[np.ndarray, "N"]:
         mask = np.zeros(len(own), bool)
-        for center, last in spheres:
-            mask[order[center, : last + 1]] = True
+        for center, ring in spheres:
+            mask |= apart[center] < (ring + 1) * step[center]
         return mask
 
     def best(mask) -> tuple[tuple[int, int], float]:
-        # With the samples sorted by distance, the worth of every radius is one running sum.
         worth = np.where(mask, 0.0, samples.worth)
-        run = np.where(allowed, np.cumsum(worth[order], axis=1), -np.inf)
-        center, last = divmod(int(run.argmax()), run.shape[1])
-        return (center, last), float(run[center, last])
+        rings = np.bincount(bin_of_pair, worth[point], minlength=len(step) * _RADII)
+        run = rings.reshape(-1, _RADII).cumsum(axis=1)
+        center, ring = divmod(int(run.argmax()), _RADII)
+        return (center, ring), float(run[center, ring])
 
     while len(chosen) < _MOST_SPHERES:
         mask = covered(chosen)
         sphere, gain = best(mask)
-        enough = (mask & own).sum() >= target
+        enough = (mask & own).sum() >= share * own.sum()
         small = gain < _LEAST_OF_PART * own.sum() or gain * samples.cell < least
         if gain <= 0 or (chosen and (enough or small)):
             break
@@ -203,12 +203,7 @@ def _cover(samples: _Samples, share: float, least: float) -> list[tuple[np.ndarr
     for _ in range(_SWEEPS if len(chosen) > 1 else 0):
         for index in range(len(chosen)):
             chosen[index] = best(covered(chosen[:index] + chosen[index + 1 :]))[0]
-    # The radius lies half way to the next sample.
-    beyond = [reach[center, min(last + 1, reach.shape[1] - 1)] for center, last in chosen]
-    return [
-        (samples.centers[center], float(reach[center, last] + after) / 2)
-        for (center, last), after in zip(chosen, beyond, strict=True)
-    ]
+    return [(samples.centers[center], (ring + 1) * step[center]) for center, ring in chosen]
 
 
 def _follow(surface: Surface, rest: Rest, joint, center, radius):

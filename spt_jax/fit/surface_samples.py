@@ -21,6 +21,11 @@ class Surface(NamedTuple):
     normal: Float[np.ndarray, "N 3"]
     tree: KDTree
 
+    @property
+    def volume(self) -> float:
+        """What the surface encloses, by the divergence theorem."""
+        return abs(float(np.einsum("nc,nc,n->", self.points, self.normal, self.area))) / 3
+
     def inside(
         self, points: Float[np.ndarray, "M 3"]
     ) -> tuple[Bool[np.ndarray, "M"], Int[np.ndarray, "M"]]:

@@ -23,6 +23,7 @@ class Topology:
     Attributes:
         faces: the faces.
         ends: vertices of each edge, the lower first.
+        end_key: the same as single numbers, lower * V + higher, which ascend.
         edge_faces: the two triangles of each edge, or -1. An edge of more than two triangles has
             a row here and in `ends` for every two of them.
         edge_id: a number for each row, the same for the rows of one edge.
@@ -40,6 +41,7 @@ class Topology:
 
     faces: Int[np.ndarray, "F 3"]
     ends: Int[np.ndarray, "R 2"]
+    end_key: Int[np.ndarray, "R"]
     edge_faces: Int[np.ndarray, "R 2"]
     edge_id: Int[np.ndarray, "R"]
     opposite: Int[np.ndarray, "F 3"]
@@ -156,6 +158,7 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     return Topology(
         faces=faces,
         ends=ends,
+        end_key=ends @ np.array([count, 1]),
         edge_faces=np.stack([half[first] // 3, np.where(paired, half[second] // 3, -1)], axis=1),
         edge_id=edge_id[first],
         opposite=opposite.reshape(faces.shape),

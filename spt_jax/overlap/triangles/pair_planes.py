@@ -17,12 +17,13 @@ def not_apart(layout: Layout, shape: Shape, t, u):
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         height, margin = _heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
-        low, high = height.min(axis=0), height.max(axis=0)
         reach = shape.contact * shape.length.take(y)
         near = np.flatnonzero(np.abs(height).min(axis=0) <= reach)
         if len(near):
             contacts.append(_contacts(layout, shape, x[near], y[near], reach[near]))
-        kept = np.flatnonzero((low <= margin) & (high >= -margin))
+        # Those that touch are kept for the other turn, too.
+        np.maximum(margin, reach, out=margin)
+        kept = np.flatnonzero((height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin))
         t, u = t[kept], u[kept]
     return t, u, np.concatenate(contacts) if contacts else np.zeros(0, np.int64)
 
