@@ -89,7 +89,7 @@ class BodySpheres(eqx.Module):
             share: of each part's volume to cover, above 0 and at most 1.
             fold_distance: in metres. Spheres nearer than this along the limbs, over the joints
                 between them, come together whenever a joint bends: the rule for folds of
-                `body.rest_surface`, here for spheres. Without it (0.0) 98 % of the mocap frames
+                `body.rest_surface`, here for spheres. Without it (0.0) 93 % of the mocap frames
                 whose skin is free collide, thigh with belly above all; with it 1 %.
 
         Raises:
