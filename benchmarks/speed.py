@@ -12,7 +12,13 @@ import numpy as np
 import tyro
 
 from benchmarks.common import Table, provenance, record_section
-from spt_jax import classify_vertices, load_body, load_mocap, self_intersection_penalty
+from spt_jax import (
+    classify_vertices,
+    host,
+    load_body,
+    load_mocap,
+    self_intersection_penalty,
+)
 
 FRAME = "crawl/0092"
 
@@ -26,11 +32,18 @@ class Settings:
     """Write the table into results.md."""
 
 
-def milliseconds(call: Callable[[], Any], repeats: int) -> tuple[float, float, float]:
-    """The 10, 50 and 90 % points of the call's time, after one call that compiles."""
+def milliseconds(
+    call: Callable[[], Any], repeats: int, again: bool = False
+) -> tuple[float, float, float]:
+    """The 10, 50 and 90 % points of the call's time, after one call that compiles.
+
+    What was measured is forgotten before each call, unless it is to be asked `again`.
+    """
     jax.block_until_ready(call())
     times = []
     for _ in range(repeats):
+        if not again:
+            host.forget()
         start = time.perf_counter()
         jax.block_until_ready(call())
         times.append(1e3 * (time.perf_counter() - start))
@@ -42,7 +55,8 @@ def main(settings: Settings) -> None:
     body, mocap = load_body(), load_mocap()
     pose = body.pose_from_smpl(jnp.asarray(mocap.pose[mocap.names.index(FRAME)]))
     vertices = body(pose).vertices
-    batch = jnp.stack([vertices] * 16)
+    frames = np.linspace(0, len(mocap.names) - 1, 16).astype(int)
+    batch = body(body.pose_from_smpl(jnp.asarray(mocap.pose[frames]))).vertices
     labels = jax.jit(lambda v: classify_vertices(v, body.faces).label)
 
     def penalty(**options):
@@ -55,6 +69,13 @@ def main(settings: Settings) -> None:
     )
     only_body = jax.jit(jax.value_and_grad(lambda p: jnp.sum(body(p).vertices ** 2)))
     default, rest = penalty(), body.rest_surface
+    lanes = jax.jit(
+        jax.vmap(jax.value_and_grad(lambda v: self_intersection_penalty(v, body.faces)))
+    )
+    for _ in range(3):  # until a batch has been worth another process, and that is there
+        host.forget()
+        jax.block_until_ready(default(batch))
+        time.sleep(1.0)
     kinds = {
         "penalty, default (exact, without rays)": default,
         "penalty, folds left out": penalty(folds=rest),
@@ -67,13 +88,17 @@ def main(settings: Settings) -> None:
         "body and its gradient, without the penalty": lambda: only_body(pose),
         "body + penalty, default": lambda: through_body(pose),
         **{name: functools.partial(call, vertices) for name, call in kinds.items()},
+        "penalty, default, the same mesh again": lambda: default(vertices),
+        "penalty, default, 16 bodies one by one, per mesh": lambda: [default(v) for v in batch],
         "penalty, default, batch of 16, per mesh": lambda: default(batch),
+        "penalty, default, vmap over 16, per mesh": lambda: lanes(batch),
         "labels, vertex rule": lambda: labels(vertices),
     }
     rows = []
     for name, call in calls.items():
-        share = 16 if "batch" in name else 1
-        times = milliseconds(call, settings.repeats // (4 if share > 1 else 1))
+        share = 16 if "per mesh" in name else 1
+        repeats = settings.repeats // (4 if share > 1 else 1)
+        times = milliseconds(call, repeats, again="again" in name)
         rows.append((name, *(f"{t / share:.1f}" for t in times)))
     table = Table(
         f"Value and gradient under jit, in milliseconds; {len(vertices)} vertices, "

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers import join, sampling, sphere
 
+from spt_jax import worker as module
 from spt_jax import workers
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.penalty import _Options, _value_and_gradient_on_host
@@ -21,7 +22,7 @@ from spt_jax.rest_surface import RestSurface
 SCRIPTS = Path(__file__).parent / "scripts"
 OPTIONS = _Options("volume", "boundary", "vertex", sampling("auto"), NOTHING)
 
-pytestmark = pytest.mark.skipif(not workers._can_start(), reason="no workers on this system")
+pytestmark = pytest.mark.skipif(not module.can_start(), reason="no workers on this system")
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +52,7 @@ def batch(count=6):
 
 def until_ready(pool, options=OPTIONS):
     """Wait for the worker, as a solver would: by asking again."""
-    work = workers._packed(_value_and_gradient_on_host, options)
+    work = module.packed(_value_and_gradient_on_host, options)
     for _ in range(2000):
         if ready := pool._ready(work, 1):
             pool._release(ready[0])
@@ -96,15 +97,16 @@ def test_same_bits_as_here_with_new_faces_and_options(pool, executor, monkeypatc
 
 
 def test_forgets_what_is_long_ago(pool, executor):
-    for k in range(workers._REMEMBERED + 2):
+    for k in range(module._REMEMBERED + 2):
         options = OPTIONS._replace(sampling=sampling(8 + k))
         worker = until_ready(pool, options)
-    assert len(worker._known) == workers._REMEMBERED
+    assert len(worker._known) == module._REMEMBERED
     check(pool, executor, batch(2), options)
 
 
 def test_one_that_dies_or_hangs_is_replaced_until_too_many_are_lost(pool, executor, monkeypatch):
     monkeypatch.setattr(workers, "_PATIENCE", (0.2, 0.0))
+    monkeypatch.setattr(module, "_PATIENCE", 0.2)
     for number, harm in enumerate((signal.SIGKILL, signal.SIGSTOP, signal.SIGKILL)):
         worker = until_ready(pool)
         worker._process.send_signal(harm)
@@ -127,7 +129,7 @@ def test_functions_that_another_process_cannot_find_stay_here(pool, executor):
     def double(vertices, faces, options, map_tasks):
         return (2 * vertices,)
 
-    assert workers._packed(double, None) is None
+    assert module.packed(double, None) is None
     found = pool.measure(double, None, batch(2), lambda: executor)
     np.testing.assert_array_equal(found[1][0], 2 * batch(2)[1][0])
     assert pool._free == []

@@ -3,11 +3,11 @@
 import os
 import signal
 
-from spt_jax import workers
+from spt_jax import worker, workers
 from spt_jax.penalty import _value_on_host
 
 workers._WORTH_STARTING = 0.0
 pool = workers.Workers()
-assert pool._ready(workers._packed(_value_on_host, None), 1) == []  # starts one
+assert pool._ready(worker.packed(_value_on_host, None), 1) == []  # starts one
 print(pool._free[0]._process.pid, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)

@@ -21,9 +21,6 @@ _FIELD = 21
 _STEPS = (1 << (_FIELD - 1)) - 2
 _GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
 _BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
-# As `vertex_winding._THINNEST`, of the longest side of the box around the mesh, which no screen
-# sees longer than twice this.
-_CONTACT = 2e-7
 _Pairs = list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -39,10 +36,7 @@ class _Boxes:
 
 @dataclass(frozen=True)
 class Shape:
-    """The triangles in their slots: corners, area normals, boxes as whole numbers and as words.
-
-    Nearer than `contact` is on the same spot, as in `vertex_winding`.
-    """
+    """The triangles in their slots: corners, area normals, boxes as whole numbers and as words."""
 
     corner: Float[np.ndarray, "3 3 S"]  # axis, corner, slot
     normal: Float[np.ndarray, "3 S"]
@@ -52,7 +46,7 @@ class Shape:
     high: Int[np.ndarray, "3 S"]
     low_word: Int[np.ndarray, "S"]
     high_word: Int[np.ndarray, "S"]
-    contact: float
+    span: float  # the longest side of the box around all
 
 
 def _face_boxes(points, faces):
@@ -79,7 +73,7 @@ def _shape(points, layout: Layout) -> Shape:
     high[:, layout.empty] = 0
     length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     words = _word(low), _word(high) | _GUARDS
-    return Shape(corner, normal, length, extent, low, high, *words, _CONTACT * span)
+    return Shape(corner, normal, length, extent, low, high, *words, span)
 
 
 def near_groups(mesh: Prepared, points):

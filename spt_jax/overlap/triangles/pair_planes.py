@@ -9,6 +9,9 @@ from spt_jax.overlap.triangles.pair_layout import Layout
 ROUNDING = 1e-14
 # A vertex beside a triangle by less than this part of its size, in the same plane, is on it.
 _BESIDE = 1e-3
+# Nearer than this part of the mesh's longest side is on the same spot, as `_THINNEST` in
+# `vertex_winding.py`: no screen shows the mesh larger by more than the root of three.
+_CONTACT = 2e-7
 
 
 def not_apart(layout: Layout, shape: Shape, t, u):
@@ -17,13 +20,14 @@ def not_apart(layout: Layout, shape: Shape, t, u):
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         height, margin = _heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
-        reach = shape.contact * shape.length.take(y)
-        near = np.flatnonzero(np.abs(height).min(axis=0) <= reach)
-        if len(near):
-            contacts.append(_contacts(layout, shape, x[near], y[near], reach[near]))
-        # Those that touch are kept for the other turn, too.
+        reach = _CONTACT * shape.span * shape.length.take(y)
         np.maximum(margin, reach, out=margin)
         kept = np.flatnonzero((height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin))
+        height, reach = height.take(kept, axis=1), reach.take(kept)
+        near = np.flatnonzero(np.abs(height).min(axis=0) <= reach)
+        if len(near):
+            x, y = x[kept[near]], y[kept[near]]
+            contacts.append(_contacts(layout, shape, x, y, reach[near]))
         t, u = t[kept], u[kept]
     return t, u, np.concatenate(contacts) if contacts else np.zeros(0, np.int64)
 
