@@ -177,3 +177,17 @@ def as_positive(name: str, value: Any) -> float:
     if not 0 < value < np.inf:
         raise ValueError(f"{name} must be positive and finite: got {value!r}.")
     return float(value)
+
+
+def count_points(keypoints: Any) -> int:
+    """The number of keypoints, for the layout to be checked against."""
+    first = keypoints
+    if isinstance(keypoints, (list, tuple)) and len(keypoints) and np.ndim(keypoints[0]) > 1:
+        first = keypoints[0]
+    shape = np.shape(first)
+    if len(shape) < 2 or shape[-1] != 2:
+        raise ValueError(
+            f"keypoints must have shape (..., K, 2), pixels: got {shape}; a third column is the "
+            "confidence, which is an argument of its own."
+        )
+    return shape[-2]

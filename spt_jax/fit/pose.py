@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
-from spt_jax.fit.inputs import Person, as_people
+from spt_jax.fit.inputs import Person
 from spt_jax.fit.objective import Objective
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits
 from spt_jax.fit.regularisers import Regulariser
-from spt_jax.fit.setup import Setup, as_limits, as_prior, make_setup
+from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import Descent, descend, unpacked
 
 # Candidates whose energy is looked at before two of them go through the regularised stages.
@@ -164,39 +164,30 @@ def fit_pose(
         >>> bool(jnp.abs(fit.keypoints - seen).max() < 10)  # pixels, of a person of 460
         True
     """
-    likely = as_prior(body, prior)
-    setup = make_setup(
+    setup, people, batch = prepare_fit(
         body,
+        keypoints,
         camera,
-        _count(keypoints),
         joints=joints,
-        people=1,
+        confidence=confidence,
         regulariser=regulariser,
-        search=pose is None,
+        pose=pose,
+        shape=shape,
+        translation=translation,
         fit_shape=fit_shape,
         fit_translation=fit_translation,
-        prior=likely,
-        limits=as_limits(body, limits),
-        weights={
-            "prior": prior_weight,
-            "limits": limits_weight,
-            "shape": shape_weight,
-            "upright": upright_weight,
-        },
+        prior=prior,
+        limits=limits,
+        prior_weight=prior_weight,
+        limits_weight=limits_weight,
+        shape_weight=shape_weight,
+        upright_weight=upright_weight,
+        expected_error=expected_error,
+        robust=robust,
         starts=starts,
         solver=solver,
         keypoint_solver=keypoint_solver,
         max_steps=max_steps,
-    )
-    # A search starts from the middle of what is likely, or from rest.
-    middle = jnp.zeros((body.num_joints, 3)) if likely is None else likely.mean
-    people, batch = as_people(
-        body,
-        keypoints,
-        confidence,
-        (middle if pose is None else pose, shape, translation),
-        expected_error,
-        robust,
     )
     found = _fit_each(setup, people)
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
@@ -263,17 +254,3 @@ def _result(setup: Setup, objective: Objective, end: Descent, steps) -> FitResul
         terms=terms,
         status=status,
     )
-
-
-def _count(keypoints: Any) -> int:
-    """The number of keypoints, for the layout to be checked against."""
-    first = keypoints
-    if isinstance(keypoints, (list, tuple)) and len(keypoints) and np.ndim(keypoints[0]) > 1:
-        first = keypoints[0]
-    shape = np.shape(first)
-    if len(shape) < 2 or shape[-1] != 2:
-        raise ValueError(
-            f"keypoints must have shape (..., K, 2), pixels: got {shape}; a third column is the "
-            "confidence, which is an argument of its own."
-        )
-    return shape[-2]

@@ -74,7 +74,8 @@ class SelfIntersection(Regulariser):
 
     Attributes:
         folds: "ignore" leaves out the creases of skin at joints, "count" counts them as overlap.
-        margin: how far apart parts are pushed, in metres; 0 measures the surface as it is.
+        margin: how far apart parts are pushed, in metres; 0 measures the surface as it is. As a
+            JAX array it may change without compiling anew.
         value, gradient: as in `self_intersection_penalty`. "ratio" with "unit" is the paper's term
             (Eqs. 10 and 11), which has no line search: use it with `optimistix.GradientDescent`.
             The ratio is in per cent then, and no gradient of the value.
@@ -87,7 +88,9 @@ class SelfIntersection(Regulariser):
     )
     _: dataclasses.KW_ONLY
     folds: Literal["ignore", "count"] = eqx.field(static=True, default="ignore")
-    margin: float = eqx.field(static=True, default=0.0, converter=as_margin)
+    margin: float | Float[Array, ""] = eqx.field(
+        default=0.0, converter=lambda given: given if isinstance(given, Array) else as_margin(given)
+    )
     value: Literal["volume", "ratio"] = eqx.field(static=True, default="volume")
     gradient: Literal["boundary", "vertex", "unit"] = eqx.field(static=True, default="boundary")
     rays: Any = eqx.field(static=True, default="auto", converter=as_rays)
@@ -111,7 +114,7 @@ class SelfIntersection(Regulariser):
         vertices = body(now.pose, now.shape, now.translation).vertices
         scene = join_bodies(vertices, body.faces)
         surface = scene.vertices
-        if self.margin:
+        if isinstance(self.margin, Array) or self.margin > 0:
             surface = inflate(surface, scene.faces, self.margin / 2)
         found = self_intersection_penalty(
             surface,

@@ -12,7 +12,7 @@ from spt_jax.camera import PinholeCamera
 from spt_jax.fit.candidates import Candidates, find_candidates, refine_start
 from spt_jax.fit.figure import Figure, make_figure
 from spt_jax.fit.flips import Limb, limbs_of
-from spt_jax.fit.inputs import Person
+from spt_jax.fit.inputs import Person, as_people, count_points
 from spt_jax.fit.objective import Objective, Weights
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
 from spt_jax.fit.regularisers import Regulariser, as_regulariser
@@ -70,37 +70,39 @@ class Setup(eqx.Module):
         )
 
 
-def make_setup(
+def prepare_fit(
     body: BodyModel,
+    keypoints: Any,
     camera: PinholeCamera,
-    count: int,
     *,
     joints: Any,
-    people: int,
+    confidence: Any,
     regulariser: Any,
-    search: bool,
+    pose: Any,
+    shape: Any,
+    translation: Any,
     fit_shape: bool,
     fit_translation: bool,
-    prior: GaussianPosePrior | None,
-    limits: JointLimits | None,
-    weights: dict[str, float],
+    prior: Any,
+    limits: Any,
+    prior_weight: float,
+    limits_weight: float,
+    shape_weight: float,
+    upright_weight: float,
+    expected_error: float | None,
+    robust: float | None,
     starts: int,
     solver: Any,
     keypoint_solver: Any,
     max_steps: int,
-) -> Setup:
-    """The setup of a call from its arguments.
+    in_scene: int = 1,
+) -> tuple[Setup, Person, tuple[int, ...]]:
+    """The setup of a call, its people in one leading axis, and the batch axes they came with.
 
     Args:
-        count: of keypoints.
-        people: how many share one scene.
-        search: whether starts are looked for, or the one that was given is taken.
-        weights: of prior, limits, shape and upright.
+        in_scene: how many people the regulariser sees together.
 
-    The others are as `fit_pose` has them.
-
-    Raises:
-        TypeError, ValueError: as `fit_pose`.
+    The others, and the errors, are as `fit_pose` has them.
     """
     if not isinstance(body, BodyModel):
         raise TypeError(f"body must be a BodyModel: got {type(body).__name__}; see load_body.")
@@ -112,35 +114,42 @@ def make_setup(
     for name, number, least in (("starts", starts, 1), ("max_steps", max_steps, 1)):
         if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
             raise ValueError(f"{name} must be a whole number of at least {least}: got {number!r}.")
+    weights = {
+        "prior_weight": prior_weight,
+        "limits_weight": limits_weight,
+        "shape_weight": shape_weight,
+        "upright_weight": upright_weight,
+    }
     for name, weight in weights.items():
-        if (
-            not isinstance(weight, (int, float, np.integer, np.floating))
-            or not 0 <= weight < np.inf
-        ):
-            raise ValueError(
-                f"{name}_weight must be a finite number, not negative: got {weight!r}."
-            )
-    figure = make_figure(body, keypoint_regressor(body, joints, count=count))
-    return Setup(
+        numeric = isinstance(weight, (int, float, np.integer, np.floating))
+        if not numeric or not 0 <= weight < np.inf:
+            raise ValueError(f"{name} must be a finite number, not negative: got {weight!r}.")
+    likely, ranges = _as_prior(body, prior), _as_limits(body, limits)
+    figure = make_figure(body, keypoint_regressor(body, joints, count=count_points(keypoints)))
+    setup = Setup(
         body=body,
         figure=figure,
         camera=camera,
-        prior=prior and prior.of_joints(figure.moving),
-        limits=limits and limits.of_joints(figure.moving),
-        weights=Weights(**{name: jnp.asarray(float(w)) for name, w in weights.items()}),
-        regulariser=as_regulariser(regulariser).prepared(body, people),
+        prior=likely and likely.of_joints(figure.moving),
+        limits=ranges and ranges.of_joints(figure.moving),
+        weights=Weights(*(jnp.asarray(float(weight)) for weight in weights.values())),
+        regulariser=as_regulariser(regulariser).prepared(body, in_scene),
         keypoint_solver=keypoint_solver or default_solver(),
         solver=solver or default_solver(),
         limbs=limbs_of(figure.body),
-        starts=int(starts) if search else 0,
+        starts=int(starts) if pose is None else 0,
         max_steps=int(max_steps),
         fit_shape=bool(fit_shape),
         fit_translation=bool(fit_translation),
     )
+    # A search starts from the middle of what is likely, or from rest.
+    middle = jnp.zeros((body.num_joints, 3)) if likely is None else likely.mean
+    start = (middle if pose is None else pose, shape, translation)
+    people, batch = as_people(body, keypoints, confidence, start, expected_error, robust)
+    return setup, people, batch
 
 
-def as_prior(body: BodyModel, prior: Any) -> GaussianPosePrior | None:
-    """The prior of an argument; ValueError for anything else."""
+def _as_prior(body: BodyModel, prior: Any) -> GaussianPosePrior | None:
     if isinstance(prior, str) and prior == "mocap":
         return pose_prior(body.joint_names)
     if prior is None or isinstance(prior, GaussianPosePrior):
@@ -148,8 +157,7 @@ def as_prior(body: BodyModel, prior: Any) -> GaussianPosePrior | None:
     raise ValueError(f'prior must be "mocap", a GaussianPosePrior or None: got {prior!r}.')
 
 
-def as_limits(body: BodyModel, limits: Any) -> JointLimits | None:
-    """The limits of an argument; ValueError for anything else."""
+def _as_limits(body: BodyModel, limits: Any) -> JointLimits | None:
     if isinstance(limits, str) and limits == "anatomical":
         return joint_limits(body.joint_names)
     if limits is None or isinstance(limits, JointLimits):

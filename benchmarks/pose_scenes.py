@@ -1,0 +1,112 @@
+"""Mocap frames seen by a camera: the scenes of `benchmarks.pose_table`."""
+
+from collections.abc import Iterator
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.oracles import RestGraph, far_crossings
+from spt_jax import BodyModel, PinholeCamera, load_body, load_mocap, self_intersection_penalty
+from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from spt_jax.fit.priors import GaussianPosePrior, pose_prior
+
+JOINTS = 22
+FOCAL, CENTER = 1200.0, (500.0, 500.0)  # pixels; a person of 1.7 m is 400 to 680 pixels tall
+NEAREST, FARTHEST = 3.0, 5.0  # metres from the camera to the middle of the joints
+NOISE, MISSING = 5.0, 0.1  # pixels; share of the joints
+MOST_SHAPE = 2.0  # standard deviations
+
+
+class Scene(NamedTuple):
+    """A body in front of a camera at the origin that looks along z with y down."""
+
+    name: str
+    pose: np.ndarray
+    shape: np.ndarray
+    translation: np.ndarray
+    exact: np.ndarray
+    noisy: np.ndarray
+    seen: np.ndarray  # 0 where the noisy keypoints lack a joint
+
+    @property
+    def motion(self) -> str:
+        """The motion that the frame is from."""
+        return self.name.split("/")[0]
+
+
+def camera() -> PinholeCamera:
+    """The camera of all scenes."""
+    return PinholeCamera(FOCAL, CENTER)
+
+
+def scenes(first: int, count: int, seed: int) -> Iterator[Scene]:
+    """`count` scenes without collisions from a seeded shuffle of all frames.
+
+    Scenes 0 to 138 are the table's; weights are tuned on later ones.
+
+    Args:
+        first: how many scenes to skip.
+        count: how many to make.
+        seed: of the shuffle and of all that is random in a scene.
+    """
+    body, mocap = load_body(), load_mocap()
+    order = np.random.default_rng(seed).permutation(len(mocap.names))
+    faces = np.asarray(body.faces, np.int64)
+    graph = RestGraph.of(np.asarray(body.template, np.float64), faces)
+    found = 0
+    for frame in order:
+        scene = _scene(body, mocap.names[frame], mocap.pose[frame], (seed, int(frame)))
+        vertices = np.asarray(_vertices(body, scene), np.float64)
+        # The penalty is quick and sees what collides; the oracle, which is not ours, confirms.
+        if float(_overlap(jnp.asarray(vertices, jnp.float32))) > 1e-9:
+            continue
+        if far_crossings(vertices, faces, graph).num_far:
+            continue
+        found += 1
+        if found > first:
+            yield scene
+        if found == first + count:
+            return
+
+
+def prior_without(motion: str) -> GaussianPosePrior:
+    """The prior of all motions but one: no fit has seen the motion that it is to find."""
+    body, mocap = load_body(), load_mocap()
+    others = [k for k, name in enumerate(mocap.names) if name.split("/")[0] != motion]
+    return pose_prior(body.joint_names, mocap.pose[others], mocap.joints)
+
+
+def _scene(body: BodyModel, name: str, frame: np.ndarray, seed: tuple[int, int]) -> Scene:
+    rng = np.random.default_rng(seed)
+    shape = np.clip(rng.normal(size=body.num_shape), -MOST_SHAPE, MOST_SHAPE).astype(np.float32)
+    turn = jnp.array([0.0, rng.uniform(0, 2 * np.pi), 0.0], jnp.float32)
+    distance = rng.uniform(NEAREST, FARTHEST)
+    pose = body.pose_from_smpl(jnp.asarray(frame))
+    # From the world's axes (y up) to the camera's (y down): half a turn about x.
+    over = jnp.diag(jnp.array([1.0, -1.0, -1.0], jnp.float32))
+    root = over @ matrix_from_axis_angle(turn) @ matrix_from_axis_angle(pose[0])
+    pose = pose.at[0].set(axis_angle_from_matrix(root))
+    joints = body(pose, shape).joints[:JOINTS]
+    translation = jnp.array([0.0, 0.0, distance], jnp.float32) - joints.mean(axis=0)
+    exact = np.asarray(camera().project(joints + translation))
+    noisy = exact + rng.normal(scale=NOISE, size=exact.shape).astype(np.float32)
+    seen = (rng.random(JOINTS) >= MISSING).astype(np.float32)
+    return Scene(name, np.asarray(pose), shape, np.asarray(translation), exact, noisy, seen)
+
+
+def _vertices(body: BodyModel, scene: Scene):
+    return body(scene.pose, scene.shape, scene.translation).vertices
+
+
+@cache
+def _compiled():
+    body = load_body()
+    rest = body.rest_surface
+    return jax.jit(lambda v: self_intersection_penalty(v, body.faces, folds=rest))
+
+
+def _overlap(vertices):
+    return _compiled()(vertices)

@@ -1,0 +1,204 @@
+"""Several people in one scene, fitted together."""
+
+import dataclasses
+import inspect
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from spt_jax.arguments import as_margin
+from spt_jax.body import BodyModel
+from spt_jax.camera import PinholeCamera
+from spt_jax.fit.inputs import Person
+from spt_jax.fit.pose import FitResult, fit_pose
+from spt_jax.fit.regularisers import SelfIntersection, as_weights
+from spt_jax.fit.setup import Setup, prepare_fit
+from spt_jax.fit.stages import descend
+from spt_jax.groups import between_groups, join_bodies, within_groups
+from spt_jax.report import intersection_report
+
+# What is tried where people still cross: the margin, times this, with the last weight again.
+_WIDER = (2.0, 4.0)
+
+
+class Penetration(eqx.Module):
+    """How far people are in each other and in themselves, the folds of skin aside.
+
+    Attributes:
+        between, within: overlap volumes, in m^3.
+        crossings_between, crossings_within: pairs of triangles that pass through each other.
+    """
+
+    between: Float[Array, ""]
+    within: Float[Array, ""]
+    crossings_between: Int[Array, ""]
+    crossings_within: Int[Array, ""]
+
+
+class PeopleResult(eqx.Module):
+    """What `fit_people` found.
+
+    Attributes:
+        people: the fits, (N, ...); `terms` are those of each person, without the penalty.
+        before: penetration of the people fitted one by one.
+        after: of the people fitted together.
+        steps: of the solver, over all stages of the scene.
+    """
+
+    people: FitResult
+    before: Penetration
+    after: Penetration
+    steps: Int[Array, ""]
+
+
+def fit_people(
+    body: BodyModel,
+    keypoints: Any,
+    camera: PinholeCamera,
+    *,
+    joints: Any,
+    weights: Any = (0.1, 1.0, 10.0),
+    margin: float = 0.002,
+    max_steps: int = 25,
+    **options: Any,
+) -> PeopleResult:
+    """People who share a scene, fitted so that they pass neither through each other nor themselves.
+
+    Each is fitted alone by `fit_pose`; then all of their parameters together minimise the sum of
+    their objectives and the overlap of the whole scene, between and within people, its weight
+    rising. Where triangles of two people, or of two parts of one, still cross, the last weight is
+    tried again with two and four times the margin.
+
+    Args:
+        body: any `BodyModel`.
+        keypoints: pixels, (N, K, 2), or a list of N people.
+        camera: the one that sees them all.
+        joints: what the keypoints are, as in `fit_pose`.
+        weights: of the overlap in cm^3, one for each stage of the scene.
+        margin: how far apart surfaces are pushed, in metres.
+        max_steps: of each stage.
+        options: of `fit_pose`, by name: confidence, shape, prior and so on; `regulariser` is what
+            each person is fitted with alone.
+
+    Returns:
+        PeopleResult. Of all stages the one with the fewest crossings between people, then within,
+        then the least overlap, is kept.
+
+    Raises:
+        TypeError, ValueError: as `fit_pose`; keypoints of another shape; an unknown option.
+
+    Differentiation: none; it runs outside jit, and decides by the values it sees.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import PinholeCamera, fit_people, load_body
+        >>> body = load_body()
+        >>> camera = PinholeCamera(1000.0, (500.0, 500.0), translation=(0.0, 0.0, 4.0))
+        >>> turned = jnp.zeros((2, 52, 3)).at[:, 0, 0].set(jnp.pi)
+        >>> apart = jnp.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        >>> seen = camera.project(body(turned, translation=apart).joints[:, :22])
+        >>> fit = fit_people(body, seen, camera, joints=body.joint_names[:22])
+        >>> int(fit.after.crossings_between)
+        0
+    """
+    known = inspect.signature(fit_pose).parameters
+    for name in options:
+        if name not in known or name in ("body", "keypoints", "camera", "joints", "max_steps"):
+            raise TypeError(f"options must be those of fit_pose: got {name!r}.")
+    if isinstance(keypoints, Tracer):
+        raise TypeError(
+            "keypoints must be known: got a traced array; fit_people decides by the values that "
+            "it sees, so call it outside jit, vmap and grad."
+        )
+    options = {"joints": joints, "max_steps": max_steps, **options}
+    alone = fit_pose(body, keypoints, camera, **options)
+    if alone.pose.ndim != 3:
+        raise ValueError(
+            f"keypoints must have shape (N, K, 2), one scene: got {np.shape(keypoints)}; fit "
+            "scenes one after another."
+        )
+    count = len(alone.pose)
+    gap = as_margin(margin)
+    defaults = {name: p.default for name, p in known.items() if p.default is not p.empty}
+    scene = SelfIntersection(weights, margin=jnp.asarray(gap))
+    setup, people, _ = prepare_fit(
+        body, keypoints, camera, **{**defaults, **options, "regulariser": scene}, in_scene=count
+    )
+    best, before = alone, _penetration(body, alone)
+    after, fits, steps = before, alone, jnp.array(0)
+    last = as_weights(weights)[-1:]
+    attempts = [(gap, as_weights(weights))] + [(gap * more, last) for more in _WIDER if gap]
+    for attempt, rising in attempts:
+        changed = dataclasses.replace(
+            setup.regulariser, margin=jnp.asarray(attempt), weights=rising
+        )
+        fits, taken = _descend_together(
+            dataclasses.replace(setup, regulariser=changed), people, fits
+        )
+        steps = steps + taken
+        found = _penetration(body, fits)
+        if _rank(found) < _rank(after):
+            best, after = fits, found
+        if not any(_rank(after)[:2]):
+            break
+    return PeopleResult(people=best, before=before, after=after, steps=steps)
+
+
+@eqx.filter_jit
+def _descend_together(
+    setup: Setup, people: Person, fits: FitResult
+) -> tuple[FitResult, Int[Array, ""]]:
+    objectives = jax.vmap(setup.objective)(people)
+    vectors = jax.vmap(
+        lambda one, pose, shape, translation: one.pack(
+            one.start._replace(pose=pose, shape=shape, translation=translation)
+        )
+    )(objectives, fits.pose, fits.shape, fits.translation)
+    end = descend(setup.regulariser, setup.body, objectives, vectors, setup.solver, setup.max_steps)
+    now = jax.vmap(lambda one, x: one.unpack(x))(objectives, end.vectors)
+    posed = setup.body(now.pose, now.shape, now.translation)
+    terms = jax.vmap(lambda one, x: one.costs(x))(objectives, end.vectors)
+    del terms["ridge"]
+    terms["total"] = sum(terms.values(), jnp.zeros(len(end.vectors), end.vectors.dtype))
+    found = FitResult(
+        pose=now.pose,
+        shape=now.shape,
+        translation=now.translation,
+        vertices=posed.vertices,
+        joints=posed.joints,
+        keypoints=jax.vmap(lambda one, x: one.project(x))(objectives, end.vectors),
+        steps=fits.steps,
+        terms=terms,
+        status=jnp.where(end.converged, 0, jnp.ones_like(fits.status)),
+    )
+    return found, end.steps
+
+
+def _penetration(body: BodyModel, fits: FitResult) -> Penetration:
+    scene = join_bodies(fits.vertices, body.faces)
+    count = len(fits.vertices)
+    rest = body.rest_surface if count == 1 else body.rest_surface.copies(count)
+    found = {}
+    for name, ignored in (("between", within_groups(count)), ("within", between_groups(count))):
+        report = intersection_report(
+            scene.vertices,
+            scene.faces,
+            face_groups=scene.face_groups,
+            ignore_groups=ignored,
+            folds=rest,
+        )
+        found[name] = jnp.asarray(report.volume, jnp.float32)
+        found[f"crossings_{name}"] = jnp.asarray(report.crossing_pairs[0])
+    return Penetration(**found)
+
+
+def _rank(found: Penetration) -> tuple[int, int, float]:
+    volume = float(found.between) + float(found.within)
+    if not np.isfinite(volume):
+        return np.iinfo(np.int64).max, 0, np.inf
+    return int(found.crossings_between), int(found.crossings_within), volume
