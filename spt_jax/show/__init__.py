@@ -1,6 +1,7 @@
 """Pictures of meshes and of numbers for people to look at."""
 
 from spt_jax.show.offscreen import RenderingUnavailable as RenderingUnavailable
+from spt_jax.show.overlay import render_overlay as render_overlay
 from spt_jax.show.pictures import plot_curves as plot_curves
 from spt_jax.show.pictures import render_before_after as render_before_after
 from spt_jax.show.pictures import render_mesh as render_mesh
