@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -125,7 +126,9 @@ def prepare_fit(
         if not numeric or not 0 <= weight < np.inf:
             raise ValueError(f"{name} must be a finite number, not negative: got {weight!r}.")
     likely, ranges = _as_prior(body, prior), _as_limits(body, limits)
-    figure = make_figure(body, keypoint_regressor(body, joints, count=count_points(keypoints)))
+    # Of the body alone, and read on the host: under jit its constants would be tracers there.
+    with jax.ensure_compile_time_eval():
+        figure = make_figure(body, keypoint_regressor(body, joints, count=count_points(keypoints)))
     setup = Setup(
         body=body,
         figure=figure,
