@@ -119,7 +119,9 @@ class Fitter:
             confidence=None if exact else np.stack([scene.seen for scene in some]),
             shape=np.stack([scene.shape for scene in some]),
             regulariser=self.regulariser(),
-            prior=None if plain else prior_without(some[0].motion),
+            # Its mean is where the search starts, whatever it weighs.
+            prior=prior_without(some[0].motion),
+            prior_weight=0.0 if plain else 1.0,
             limits=None if plain else "anatomical",
             upright_weight=0.0 if plain else 0.25,
             solver=optx.GradientDescent(PAPER_RATE, rtol=1e-3, atol=1e-3)

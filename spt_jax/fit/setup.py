@@ -145,8 +145,8 @@ def prepare_fit(
         fit_shape=bool(fit_shape),
         fit_translation=bool(fit_translation),
     )
-    # A search starts from the middle of what is likely, or from rest.
-    middle = jnp.zeros((body.num_joints, 3)) if likely is None else likely.mean
+    # A search starts from the middle of what is likely: a T-pose is far from any that people take.
+    middle = (likely or pose_prior(body.joint_names)).mean
     start = (middle if pose is None else pose, shape, translation)
     people, batch = as_people(body, keypoints, confidence, start, expected_error, robust)
     return setup, people, batch
