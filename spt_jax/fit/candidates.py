@@ -133,7 +133,7 @@ def _fit(objective: Objective, vector, solver, max_steps):
 def _two_best(vectors, costs):
     """Of the best, and of the best of those that are not the same minimum; itself if all are."""
     best = jnp.argmin(costs)
-    same = jnp.max(jnp.abs(vectors - vectors[best]), axis=-1) < _SAME
+    same = jnp.max(jnp.abs(vectors - vectors[best][None]), axis=-1) < _SAME
     other = jnp.argmin(jnp.where(same, jnp.inf, costs))
     return jnp.stack([best, jnp.where(jnp.all(same), best, other)])
 

@@ -50,30 +50,34 @@ def orientation_starts(objective: Objective, count: int) -> Float[Array, "count 
     points, joints = objective.figure.points_and_joints(origin)
     weights = objective.confidence * jnp.asarray(_trunk_weights(objective.names), dtype)
     total = jnp.maximum(jnp.sum(weights), jnp.finfo(dtype).tiny)
-    image = (objective.keypoints - camera.center) / camera.focal
+    center, focal = camera.center.astype(dtype)[None], camera.focal.astype(dtype)[None]
+    image = (objective.keypoints - center) / focal
     image_centre = jnp.sum(weights[:, None] * image, axis=0) / total
     centre = jnp.sum(weights[:, None] * points, axis=0) / total
     views = jnp.asarray(_views(_NUM_VIEWS), dtype)
 
-    target = _as_complex(image - image_centre)
-    seen = _as_complex(jnp.einsum("vij,kj->vki", views, points - centre))
-    overlap = jnp.sum(weights * jnp.conj(seen) * target, axis=-1)
-    size = jnp.sum(weights * jnp.abs(seen) ** 2, axis=-1)
-    spread = jnp.sum(weights * jnp.abs(target) ** 2)
+    from_centre = image - image_centre[None]
+    target = _as_complex(weights[:, None] * from_centre)
+    seen = _as_complex(jnp.einsum("vij,kj->vki", views, points - centre[None]))
+    overlap = jnp.sum(jnp.conj(seen) * target[None], axis=-1)
+    size = jnp.sum(weights[None] * jnp.abs(seen) ** 2, axis=-1)
+    spread = jnp.sum(weights[:, None] * from_centre**2)
     told = (size > 1e-6 * total) & (spread > 1e-12 * total)
-    scale = jnp.where(told, overlap / jnp.where(told, size, 1.0), 1.0 / _USUAL)
-    explained = jnp.where(told, jnp.abs(overlap) ** 2 / jnp.where(told, size, 1.0), 0.0)
+    size = jnp.where(told, size, 1.0)
+    scale = jnp.where(told, jnp.abs(overlap) / size, 1.0 / _USUAL)
+    angle = jnp.where(told, jnp.angle(overlap), 0.0)
+    explained = jnp.where(told, jnp.abs(overlap) ** 2 / size, 0.0)
     unexplained = 1 - explained / jnp.where(spread > 0, spread, 1.0)
-    turned = _in_image(jnp.angle(scale)) @ views
+    turned = _in_image(angle) @ views
     # The body's up against the image's, and whether it faces the camera.
     score = unexplained + _UPRIGHT * (1 + turned[:, 1, 1]) + _FACING * (1 + turned[:, 2, 2])
     chosen = _spread_out(score, turned, count)
 
-    distance = jnp.clip(1 / jnp.abs(scale[chosen]), _NEAREST, _FARTHEST)
-    at = jnp.concatenate([image_centre, jnp.ones(1, dtype)]) * distance[:, None]
+    distance = jnp.clip(1 / scale[chosen], _NEAREST, _FARTHEST)
+    at = jnp.concatenate([image_centre, jnp.ones(1, dtype)])[None] * distance[:, None]
     root = camera.rotation.astype(dtype).T @ turned[chosen]
-    world = (at - camera.translation.astype(dtype)) @ camera.rotation.astype(dtype)
-    moved = world - (jnp.einsum("sij,j->si", root, centre - joints[0]) + joints[0])
+    world = (at - camera.translation.astype(dtype)[None]) @ camera.rotation.astype(dtype)
+    moved = world - jnp.einsum("sij,j->si", root, centre - joints[0]) - joints[:1]
 
     def packed(root, moved):
         pose = rest.at[0].set(axis_angle_from_matrix(root))
