@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from spt_jax.arguments import as_choice, as_directions, as_margin, as_rays
@@ -220,6 +221,8 @@ def as_weights(weights: Any) -> Float[Array, "stages"]:
     Raises:
         ValueError: none at all, or negative or not finite ones.
     """
+    if isinstance(weights, Tracer):  # as when a regulariser is prepared inside jit
+        return jnp.atleast_1d(weights)
     rows = np.atleast_1d(np.asarray(weights, np.float64))
     if rows.ndim != 1 or not rows.size or not np.isfinite(rows).all() or rows.min() < 0:
         raise ValueError(
