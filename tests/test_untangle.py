@@ -8,7 +8,7 @@ import pytest
 from helpers import body_faces, embedded_body, mocap
 
 from spt_jax import self_intersection_penalty, untangle_pose
-from spt_jax.untangle import untangle
+from spt_jax.untangle import pose as untangle
 
 QUICK = {"folds": "count", "rays": 64, "weights": (0.1, 1.0, 10.0), "steps_per_weight": 20}
 

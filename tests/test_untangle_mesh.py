@@ -211,7 +211,7 @@ def test_a_mesh_file_is_freed_in_its_own_format(suffix, tmp_path, capsys):
 def test_a_mesh_file_that_does_not_come_free_says_so(tmp_path, capsys, monkeypatch):
     import trimesh
 
-    from spt_jax.untangle import untangle_mesh as module
+    from spt_jax.untangle import mesh as module
 
     def hasty(*mesh, **options):
         return untangle_mesh(*mesh, **{**options, "attempts": 1, "steps_per_attempt": 1})
