@@ -1,4 +1,4 @@
-"""The command line: spt-jax demo, check and untangle."""
+"""The command line: spt-jax demo, check, untangle and fit."""
 
 import os
 import sys
@@ -9,17 +9,19 @@ import tyro
 
 from spt_jax.commands.check import check
 from spt_jax.commands.demo import demo
+from spt_jax.commands.fit import fit
 from spt_jax.commands.terminal import CommandError
 from spt_jax.commands.untangle import untangle
 
-_COMMANDS = {"demo": demo, "check": check, "untangle": untangle}
+_COMMANDS = {"demo": demo, "check": check, "untangle": untangle, "fit": fit}
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
-    0: done. 1: `check` found a self-intersection, or `untangle` left one in a mesh. 2: the input or
-    the output folder is at fault, said in one line on the standard error stream. 130: interrupted.
+    0: done. 1: `check` found a self-intersection, `untangle` left one in a mesh, or `fit` could not
+    fit somebody. 2: the input or the output folder is at fault, said in one line on the standard
+    error stream. 130: interrupted.
 
     Args:
         args: the words after `spt-jax`; those of the process if None.
@@ -28,7 +30,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return tyro.extras.subcommand_cli_from_dict(
             _COMMANDS,
             prog="spt-jax",
-            description="See and remove self-intersections of triangle meshes and body models.",
+            description="Self-intersections of meshes and bodies, removed; bodies from keypoints.",
             args=args,
             config=(tyro.conf.FlagCreatePairsOff,),
         )

@@ -23,7 +23,8 @@ _OPACITY = 0.85  # of a body over a photograph: what lies under it still shows
 _OVERSAMPLING = 2
 # Above this many pixels a picture is fine enough as it is, and twice its sides too much memory.
 _LARGE = 3_000_000
-_LARGEST = 8192  # pixels of a side: what every off-screen window can do
+#: Pixels of a picture's side: what every off-screen window can do.
+LARGEST = 8192
 
 
 def render_overlay(
@@ -99,9 +100,11 @@ def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "height width 
         path: a file of any kind that Pillow reads.
 
     Raises:
+        ImportError: Pillow is not installed.
         FileNotFoundError: there is no such file.
         ValueError: it is no image, or is cut or damaged.
     """
+    import_extra("PIL")
     from PIL import Image, ImageOps
 
     file = Path(path)
@@ -134,9 +137,9 @@ def _as_photograph(image: Any) -> Float[np.ndarray, "height width 3"]:
             "image must be (height, width, 3) of uint8, a file or (width, height): got "
             f"{photograph.dtype} {photograph.shape}."
         )
-    if not 16 <= min(photograph.shape[:2]) <= max(photograph.shape[:2]) <= _LARGEST:
+    if not 16 <= min(photograph.shape[:2]) <= max(photograph.shape[:2]) <= LARGEST:
         raise ValueError(
-            f"image must have sides of 16 to {_LARGEST} pixels: got {photograph.shape[1]} by "
+            f"image must have sides of 16 to {LARGEST} pixels: got {photograph.shape[1]} by "
             f"{photograph.shape[0]}; scale it, its keypoints and the camera together."
         )
     return photograph.astype(np.float64)

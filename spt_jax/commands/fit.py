@@ -1,0 +1,150 @@
+"""`spt-jax fit`: bodies from a file of 2D keypoints."""
+
+import json as json_format
+import time
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from spt_jax.commands.terminal import (
+    CommandError,
+    err_console,
+    out_console,
+    progress_bar,
+    show,
+    user_errors,
+)
+
+
+def fit(
+    keypoints: tyro.conf.Positional[Path],
+    out: Path = Path("fitted"),
+    joints: str | None = None,
+    camera: Path | None = None,
+    focal: float | None = None,
+    center: tuple[float, float] | None = None,
+    image: Path | None = None,
+    people: str = "all",
+    body: str = "anny",
+    regulariser: Literal["spt", "none", "spheres", "laplacian"] = "spt",
+    robust: float | Literal["auto", "off"] = "auto",
+    fit_shape: bool = False,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Find the 3D poses of the people in a file of 2D keypoints.
+
+    Takes COCO's annotations and results, OpenPose's JSON, and JSON or .npz files of this project
+    ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
+    .glb of each person coloured by class, a picture of each image with the bodies over it, and
+    report.json. The exit code is 1 if somebody could not be fitted.
+
+    Args:
+        keypoints: the file, .json or .npz.
+        out: folder for the results, made where missing.
+        joints: the keypoints' layout, such as coco17, body25, h36m17 or smpl24; what the file says
+            if not given.
+        camera: a .json or .npz file with a 3 x 4 matrix, or with focal and center. Without it and
+            the next two, one that spans 55 degrees over the image's longer side.
+        focal: focal length in pixels.
+        center: principal point in pixels; the image's middle if not given.
+        image: the photograph, or a folder of them, to draw over; a blank canvas if not given.
+        people: which people: rows from 0, ranges, images and names, such as 0,3-5 or 000000000139
+        body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
+            (.npz, .pkl).
+        regulariser: what keeps a body from passing through itself: the self-intersection penalty,
+            nothing, or the paper's rivals.
+        robust: how far off, in pixels, a keypoint is half taken for a mistake (Geman-McClure);
+            "auto" is 5 % of the larger side of the box around the person's keypoints; "off" trusts
+            them all.
+        fit_shape: fit the body's shape too.
+        json: print the report as JSON in place of the table.
+        quiet: print errors alone.
+    """
+    if robust not in ("auto", "off") and not robust > 0:
+        raise CommandError(
+            f"robust must be a positive number of pixels, auto or off: got {robust}."
+        )
+    from spt_jax.commands.annotated import gather
+    from spt_jax.keypoints import keypoint_regressor, read_keypoints
+    from spt_jax.output_files import ensure_folder, write_json
+
+    with user_errors():
+        file = read_keypoints(keypoints, layout=joints)
+        chosen, notes = gather(
+            keypoints,
+            file,
+            people=people,
+            image=image,
+            camera=camera,
+            focal=focal,
+            center=center,
+        )
+    start = time.perf_counter()
+    with progress_bar(len(chosen), quiet) as state:
+        state("loading the body")
+        from spt_jax.body import load_body
+        from spt_jax.commands.fitted import (
+            as_report,
+            draw,
+            fit_everyone,
+            people_table,
+            summary,
+            write_bodies,
+        )
+
+        with user_errors():
+            model = load_body(body)
+            for layout in {one.person.layout for one in chosen}:
+                keypoint_regressor(model, layout)
+            folder = ensure_folder(out)
+        if any(one.camera_source == "estimated" for one in chosen):
+            notes.append(
+                "the camera is not known; one that spans 55 degrees is taken, and distances are as "
+                "uncertain as that (--camera, --focal)"
+            )
+        for note in notes:
+            show(err_console(quiet), f"note: {note}", "yellow")
+        done = fit_everyone(
+            model, chosen, regulariser=regulariser, robust=robust, fit_shape=fit_shape, state=state
+        )
+        with user_errors():
+            state("writing", done=len(chosen))
+            meshes = write_bodies(folder, done, model, fit_shape)
+            state("drawing")  # after the rest is safe
+            pictures, missing = draw(folder, done, model.faces)
+            settings = {
+                "keypoints": str(keypoints),
+                "joints": joints,
+                "people": people,
+                "body": body,
+                "regulariser": regulariser,
+                "robust": robust,
+                "fit_shape": fit_shape,
+            }
+            report = as_report(done, settings)
+            report["seconds"] = round(time.perf_counter() - start, 3)
+            report["notes"] = notes
+            report["meshes"] = meshes
+            report["pictures"] = pictures
+            report["pictures_left_out"] = missing
+            write_json(folder / "report.json", report)
+    lost = [one.name for one in done if not one.usable]
+    if json:
+        print(json_format.dumps(report, indent=2))
+    else:
+        console = out_console(quiet)
+        console.print(people_table(done))
+        show(console, summary(done))
+        drawn = f", {', '.join(pictures[:3])}{', ...' if len(pictures) > 3 else ''}"
+        show(
+            console,
+            f"{report['seconds']:.0f} s; in {folder}: {len(meshes)} meshes (.glb), poses.npz, "
+            f"report.json{drawn if pictures else ''}",
+        )
+    if missing:
+        show(err_console(quiet), f"Pictures were left out: {missing}", "yellow")
+    for name in lost:
+        show(err_console(quiet), f"{name} could not be fitted; see report.json", "red")
+    return 1 if lost else 0

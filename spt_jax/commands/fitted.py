@@ -1,0 +1,346 @@
+"""What `spt-jax fit` does with people once they are gathered: fit, tell, write, draw."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from spt_jax.commands.annotated import Annotated
+from spt_jax.commands.frames import _versions
+from spt_jax.commands.terminal import State
+from spt_jax.report import IntersectionReport
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spt_jax.body import BodyModel
+    from spt_jax.fit.pose import FitResult
+
+Named = Literal["spt", "none", "spheres", "laplacian"]
+
+# People fitted side by side. More take more memory and wait for the slowest of them; a file's last
+# batch is filled up, so that everything compiles once.
+_BATCH = 16
+
+# Detectors make mistakes, and a square counts one of them for more than all the rest. Mean joint
+# error of 24 motion-capture frames with 5 pixels of noise (2 % of the person), when none, one or
+# two of the 17 keypoints are off by 20 to 50 % of the person: 70, 200, 279 mm with plain squares;
+# 72, 74, 86 mm with this scale; 73, 102, 98 mm with twice as much; 74, 141, 181 mm with four times.
+_ROBUST_SHARE = 0.05
+_SIDE = 1000.0
+
+_LARGEST_CANVAS = 2000  # pixels of a side, where there is no photograph
+_CUBIC_CENTIMETRES = 1e6
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One person fitted."""
+
+    given: Annotated
+    pose: Float[np.ndarray, "J 3"]
+    shape: Float[np.ndarray, "B"]
+    translation: Float[np.ndarray, "3"]
+    vertices: Float[np.ndarray, "V 3"]
+    keypoints: Float[np.ndarray, "K 2"]
+    distance: float  # of the root joint along the line of sight, in metres
+    terms: dict[str, float]
+    status: int
+    reason: str
+    steps: int
+    seconds: float  # its share of the batch
+    overlap: IntersectionReport | None = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """Of the person."""
+        return self.given.name
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is a body."""
+        return self.overlap is not None
+
+    @property
+    def errors(self) -> Float[np.ndarray, "seen"]:
+        """Distances of the points that were seen from where the body has them, in pixels."""
+        person = self.given.person
+        off = np.linalg.norm(self.keypoints - person.points, axis=1)
+        return off[person.confidence > 0]
+
+
+def fit_everyone(
+    body: "BodyModel",
+    people: Sequence[Annotated],
+    *,
+    regulariser: Named,
+    robust: "float | Literal['auto', 'off']",
+    fit_shape: bool,
+    state: State,
+) -> list[Fitted]:
+    """Fit all people, in batches of one layout each, and measure the bodies' overlaps."""
+    found: dict[str, Fitted] = {}
+    for layout in dict.fromkeys(one.person.layout for one in people):
+        alike = [one for one in people if one.person.layout == layout]
+        size = min(len(alike), _BATCH)
+        for first in range(0, len(alike), size):
+            batch = alike[first : first + size]
+            what = batch[0].name if len(batch) == 1 else f"{len(batch)} people"
+            new = "compiling, which takes 10 to 40 s, then " if first == 0 else ""
+            state(f"{new}fitting {what} ({layout})", done=len(found))
+            start = time.perf_counter()
+            result, scales = _fit_batch(body, batch, size, layout, regulariser, robust, fit_shape)
+            seconds = (time.perf_counter() - start) / len(batch)
+            state(f"measuring {what}")
+            for k, one in enumerate(batch):
+                found[one.name] = _as_fitted(body, one, result, k, float(scales[k]), seconds)
+    return [found[one.name] for one in people]
+
+
+def _fit_batch(
+    body: "BodyModel",
+    batch: Sequence[Annotated],
+    size: int,
+    layout: str,
+    regulariser: Named,
+    robust: "float | Literal['auto', 'off']",
+    fit_shape: bool,
+) -> "tuple[FitResult, Float[np.ndarray, 'N']]":
+    from spt_jax.fit import pose as fitting
+
+    filled = [*batch, *[batch[-1]] * (size - len(batch))]
+    points = np.stack([one.person.points for one in filled])
+    trust = np.stack([one.person.confidence for one in filled])
+    scales = np.ones(size)
+    if robust == "auto":
+        # A pixel's size is free as long as the camera has the same: with every person as many
+        # pixels tall, one scale in pixels is the same share of each.
+        sides = np.array([_box_side(one) for one in filled])
+        scales = np.where(sides >= 1, _SIDE / np.maximum(sides, 1), 1.0)
+    cameras = [_scaled(one.camera, scale) for one, scale in zip(filled, scales, strict=True)]
+    scale = None if robust == "off" else _ROBUST_SHARE * _SIDE if robust == "auto" else robust
+
+    def one_person(points, trust, camera):
+        return fitting.fit_pose(
+            body,
+            points,
+            camera,
+            joints=layout,
+            confidence=trust,
+            regulariser=regulariser,
+            robust=scale,
+            fit_shape=fit_shape,
+        )
+
+    result = jax.vmap(one_person)(
+        jnp.asarray(points * scales[:, None, None], jnp.float32),
+        jnp.asarray(trust, jnp.float32),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras),
+    )
+    return jax.tree.map(np.asarray, result), scales
+
+
+def _box_side(one: Annotated) -> float:
+    seen = one.person.points[one.person.confidence > 0]
+    return float(np.ptp(seen, axis=0).max())
+
+
+def _scaled(camera: Any, scale: float) -> Any:
+    from spt_jax.camera import PinholeCamera
+
+    parts = (camera.focal * scale, camera.center * scale, camera.rotation, camera.translation)
+    return PinholeCamera(*(np.asarray(part, np.float32) for part in parts), near=camera.near)
+
+
+def _as_fitted(
+    body: "BodyModel", one: Annotated, result: Any, k: int, scale: float, seconds: float
+) -> Fitted:
+    from spt_jax.report import intersection_report
+
+    vertices = result.vertices[k]
+    overlap = None
+    if np.isfinite(vertices).all():
+        overlap = intersection_report(vertices, body.faces, folds=body.rest_surface)
+    root = np.asarray(one.camera.to_camera(jnp.asarray(result.joints[k, :1])))[0]
+    reason = result.reason
+    return Fitted(
+        given=one,
+        pose=result.pose[k],
+        shape=result.shape[k],
+        translation=result.translation[k],
+        vertices=vertices,
+        keypoints=result.keypoints[k] / scale,
+        distance=float(root[2]),
+        terms={name: float(value[k]) for name, value in result.terms.items()},
+        status=int(result.status[k]),
+        reason=reason[k],
+        steps=int(result.steps[k]),
+        seconds=seconds,
+        overlap=overlap,
+    )
+
+
+def people_table(people: Sequence[Fitted]) -> "Table":
+    """The table that people read: one row a person."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(header_style="bold", padding=0, collapse_padding=True)
+    table.add_column("person", overflow="ellipsis", no_wrap=True)
+    for heading in (
+        "points\nseen",
+        "error, px\nmedian",
+        "\nlargest",
+        "distance\nm",
+        "overlap\ncm³",
+        "crossings",
+        "status",
+    ):
+        table.add_column(heading, justify="right", no_wrap=heading != "status")
+    for one in people:
+        if one.overlap is None:
+            blank = [str(len(one.errors)), *[""] * 5]
+            table.add_row(escape(one.name), *blank, f"[red]{one.reason}[/red]")
+            continue
+        colour = "green" if one.overlap.volume == 0 else "default"
+        table.add_row(
+            escape(one.name),
+            str(len(one.errors)),
+            f"{np.median(one.errors):.1f}",
+            f"{one.errors.max():.1f}",
+            f"{one.distance:.2f}",
+            f"[{colour}]{one.overlap.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
+            f"[{colour}]{one.overlap.crossing_pairs[0]}[/{colour}]",
+            one.reason.split(":")[0],
+        )
+    return table
+
+
+def summary(people: Sequence[Fitted]) -> str:
+    """All people in one line."""
+    bodies = [one for one in people if one.overlap is not None]
+    count = "1 person" if len(people) == 1 else f"{len(people)} people"
+    if not bodies:
+        return f"{count}: none could be fitted"
+    errors = np.concatenate([one.errors for one in bodies])
+    overlap = sum(one.overlap.volume for one in bodies if one.overlap) * _CUBIC_CENTIMETRES
+    seconds = np.mean([one.seconds for one in bodies])
+    return (
+        f"{count}: points {np.median(errors):.1f} pixels off (median), {overlap:.2f} cm³ of "
+        f"overlap in all, {seconds:.1f} s each with compiling"
+    )
+
+
+def as_report(people: Sequence[Fitted], settings: dict[str, Any]) -> dict[str, Any]:
+    """What report.json holds."""
+    return {
+        "command": "fit",
+        "versions": _versions(),
+        "settings": settings,
+        "units": {"length": "m", "image": "px", "volume": "m^3", "time": "s", "angle": "rad"},
+        "people": [_person_report(one) for one in people],
+    }
+
+
+def _person_report(one: Fitted) -> dict[str, Any]:
+    person, camera = one.given.person, one.given.camera
+    errors = one.errors
+    return {
+        "name": one.name,
+        "image": person.image,
+        "id": person.id,
+        "layout": person.layout,
+        "image_size": list(one.given.size),
+        "camera": {
+            "source": one.given.camera_source,
+            "focal": np.asarray(camera.focal, np.float64).tolist(),
+            "center": np.asarray(camera.center, np.float64).tolist(),
+            "rotation": np.asarray(camera.rotation, np.float64).tolist(),
+            "translation": np.asarray(camera.translation, np.float64).tolist(),
+        },
+        "status": one.status,
+        "reason": one.reason,
+        "points_seen": len(errors),
+        "reprojection_error": {
+            "mean": _number(errors.mean()),
+            "median": _number(np.median(errors)),
+            "largest": _number(errors.max()),
+        },
+        "distance": _number(one.distance),
+        "terms": {name: _number(value) for name, value in one.terms.items()},
+        "intersection": None if one.overlap is None else one.overlap.as_dict(),
+        "steps": one.steps,
+        "seconds": round(one.seconds, 3),
+    }
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def write_bodies(
+    folder: Path, people: Sequence[Fitted], body: "BodyModel", with_shape: bool
+) -> list[str]:
+    """Write poses.npz and a .glb a person; return the meshes' names.
+
+    The poses are in the world of the camera. A camera without a rotation has y down; the meshes are
+    turned then, so that viewers show them upright: y up, the camera looking along -z, as in glTF.
+    """
+    from spt_jax.body.pose_files import write_poses
+    from spt_jax.mesh_files import write_mesh
+
+    names = []
+    bodies = [one for one in people if one.overlap is not None]
+    for one in bodies:
+        turned = np.allclose(one.given.camera.rotation, np.eye(3), atol=1e-6)
+        vertices = one.vertices * ([1.0, -1.0, -1.0] if turned else 1.0)
+        names.append(f"{one.name.replace('/', '_')}.glb")
+        labels = None if one.overlap is None else one.overlap.labels
+        write_mesh(folder / names[-1], vertices, np.asarray(body.faces), labels)
+    if bodies:
+        write_poses(
+            folder / "poses.npz",
+            np.stack([one.pose for one in bodies]),
+            shape=np.stack([one.shape for one in bodies]) if with_shape else None,
+            translation=np.stack([one.translation for one in bodies]),
+            names=[one.name for one in bodies],
+        )
+    return names
+
+
+def draw(folder: Path, people: Sequence[Fitted], faces: Any) -> tuple[list[str], str | None]:
+    """Draw the bodies of each image over it; the pictures' names, or why there are none."""
+    from spt_jax.show import RenderingUnavailable, render_overlay
+
+    names = []
+    for image in dict.fromkeys(one.given.image for one in people):
+        there = [one for one in people if one.given.image == image]
+        first = there[0].given
+        bodies = [one for one in there if one.usable]
+        canvas, shrink = first.photograph, 1.0
+        if canvas is None:
+            shrink = min(1.0, _LARGEST_CANVAS / max(first.size))
+            width, height = (max(round(shrink * side), 16) for side in first.size)
+            canvas = (width, height)
+        try:
+            render_overlay(
+                canvas,
+                [one.vertices for one in bodies],
+                faces,
+                _scaled(first.camera, shrink),
+                [one.given.person.points * shrink for one in there],
+                [one.given.person.confidence for one in there],
+                [one.keypoints * shrink for one in there],
+                skeleton=[one.given.person.layout for one in there],
+                path=folder / f"{image}.png",
+            )
+        except (ImportError, RenderingUnavailable) as error:
+            return names, " ".join(str(error).split())
+        names.append(f"{image}.png")
+    return names, None
