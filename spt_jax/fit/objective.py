@@ -12,9 +12,9 @@ from spt_jax.camera import PinholeCamera
 from spt_jax.fit.figure import Figure, Variables
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits
 
-# Per squared radian (and squared unit of shape, and squared metre) away from the start. It decides
-# where nothing else does, as for the twist of a limb without a prior; a radian costs as much as
-# one keypoint that is off by 3 % of its expected error.
+# Per squared radian (and squared unit of shape) away from the start. It decides where nothing else
+# does, as for the twist of a limb without a prior; a radian costs as much as one keypoint that is
+# off by 3 % of its expected error.
 _RIDGE = 1e-3
 
 # Added to the Gauss-Newton matrix whose factor the penalty's stages take as coordinates, per
@@ -117,7 +117,13 @@ class Objective(eqx.Module):
         found["upright"] = jnp.sqrt(self.weights.upright) * (
             matrix_from_axis_angle(moved.pose[0])[:, 1] - self.up
         )
-        found["ridge"] = jnp.sqrt(_RIDGE) * (vector - self.pack(self.start))
+        ridge = jnp.sqrt(_RIDGE) * (vector - self.pack(self.start))
+        if self.fit_translation:
+            # Not of the translation: where a search starts it is zero, the camera's own place, and
+            # a body of which one point is seen would walk into the camera.
+            end = 3 * len(self.figure.moving)
+            ridge = ridge.at[end : end + 3].set(0.0)
+        found["ridge"] = ridge
         return found
 
     def costs(self, vector: Float[Array, "D"]) -> dict[str, Float[Array, ""]]:
