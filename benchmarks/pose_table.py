@@ -12,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,7 +27,6 @@ from spt_jax import classify_vertices, fit_pose, load_body
 from spt_jax.fit.regularisers import Laplacian, Nothing, Regulariser, SelfIntersection, Spheres
 
 TABLE_SCENES = 139  # as many as the paper's reduced test set of UP-3D
-BATCH = 8
 RISE = (0.01, 0.1, 1.0)  # of each method's weight, stage by stage
 PAPER_RATE = 0.3  # gradient descent in coordinates in which the keypoints' cost is round
 
@@ -131,18 +129,14 @@ class Fitter:
 
 
 def fitted(fitter: Fitter, some: Sequence[Scene], condition: str) -> Iterator[tuple[int, Outcome]]:
-    """The outcome of each scene with its place in the list, in batches of one motion."""
+    """The outcome of each scene with its place in the list, a motion at a time."""
     by_motion = defaultdict(list)
     for place, scene in enumerate(some):
         by_motion[scene.motion].append(place)
     for places in by_motion.values():
-        rows = iter(places)
-        while batch := list(islice(rows, BATCH)):
-            # A full batch has the shape that is compiled already; copies cost next to nothing.
-            padded = batch + batch[:1] * (BATCH - len(batch))
-            result = fitter([some[place] for place in padded], condition)
-            outcomes = judged(fitter.body, [some[place] for place in padded], result)
-            yield from zip(batch, outcomes[: len(batch)], strict=True)
+        chosen = [some[place] for place in places]
+        outcomes = judged(fitter.body, chosen, fitter(chosen, condition))
+        yield from zip(places, outcomes, strict=True)
 
 
 def judged(body, some: Sequence[Scene], result) -> list[Outcome]:

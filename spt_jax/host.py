@@ -152,7 +152,7 @@ def _host_entry(function, options, results, vertices_spec, faces_spec):
     def measured_anew(meshes):
         meshes = [(vertices.astype(np.float64), faces) for vertices, faces in meshes]
         if len(meshes) == 1:
-            found = [function(*meshes[0], options, parallel_map)]
+            found = [_workers.measure_one(function, options, meshes[0], parallel_map)]
         else:
             found = _workers.measure(function, options, meshes, _executor)
         return [

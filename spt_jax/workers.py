@@ -28,6 +28,9 @@ _MOST_WORKERS = 7
 # Triangles in a batch for it to be shared: handing a mesh over costs as much as some 500.
 _WORTH_SHARING = 10_000
 
+# Triangles of one mesh for it to be measured elsewhere.
+_WORTH_ASKING = 2_000
+
 # A worker that answers later than this is lost: seconds, and microseconds for each triangle, a
 # hundred times what is usual. After so many losses there are no more workers.
 _PATIENCE = 20.0, 100.0
@@ -43,6 +46,33 @@ class Workers:
         self._number = 0
         self._losses = 0
         self._spent = 0.0
+        self._at_work = 0
+
+    def measure_one(
+        self, function: Function, options: Hashable, mesh: Mesh, map_tasks: Callable[..., Any]
+    ) -> tuple[np.ndarray, ...]:
+        """The function of one mesh: here, or elsewhere while another thread measures here."""
+        with self._lock:
+            alone = self._at_work == 0
+            self._at_work += 1
+        begin = time.perf_counter()
+        try:
+            size = len(mesh[1])
+            work = packed(function, options) if not alone and size > _WORTH_ASKING else None
+            for worker in () if work is None else self._ready(work, 1):
+                try:
+                    found = worker.measure(work, mesh, _PATIENCE[0] + 1e-6 * _PATIENCE[1] * size)
+                except LostError:
+                    self._drop(worker)
+                else:
+                    self._release(worker)
+                    return found
+            return function(*mesh, options, map_tasks)
+        finally:
+            with self._lock:
+                self._at_work -= 1
+                if not alone:
+                    self._spent += time.perf_counter() - begin
 
     def measure(
         self,
