@@ -106,7 +106,7 @@ def test_a_coco_file_of_several_people_and_images(calls, tmp_path, capsys, rng):
         assert read_image(out / pictures[1]).shape == (640, 427, 3)
 
     # One call for all, with squares that bend at the same share of each person.
-    assert len(calls) == 1 and calls[0]["robust"] == 50.0 and calls[0]["regulariser"] == "spt"
+    assert len(calls) == 1 and calls[0]["robust"] == 100.0 and calls[0]["regulariser"] == "spt"
     poses = read_poses(out / "poses.npz")
     assert poses.names == names and poses.pose.shape == (3, 52, 3) and poses.shape is None
     np.testing.assert_allclose(poses.translation, [[0, 0, 4]] * 3)

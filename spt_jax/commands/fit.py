@@ -56,7 +56,7 @@ def fit(
         regulariser: what keeps a body from passing through itself: the self-intersection penalty,
             nothing, or the paper's rivals.
         robust: how far off, in pixels, a keypoint is half taken for a mistake (Geman-McClure);
-            "auto" is 5 % of the larger side of the box around the person's keypoints; "off" trusts
+            "auto" is 10 % of the larger side of the box around the person's keypoints; "off" trusts
             them all.
         fit_shape: fit the body's shape too.
         json: print the report as JSON in place of the table.
