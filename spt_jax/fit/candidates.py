@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
@@ -74,8 +75,7 @@ def _rounds(objective, limbs, starts, solver, max_steps):
     def flipped(vectors, costs, chunk):
         best = _two_best(vectors[:starts], costs[:starts])
         every = jax.vmap(lambda x: limb_flips(objective, x, limbs))(vectors[best])
-        every = every.reshape(flips, -1)
-        padded = jnp.concatenate([every, every])[: chunks * starts]
+        padded = every.reshape(flips, -1)[np.arange(chunks * starts) % flips]
         return jax.lax.dynamic_slice_in_dim(padded, chunk * starts, starts)
 
     def combined(vectors, costs, chunk):

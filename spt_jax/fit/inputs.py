@@ -90,7 +90,10 @@ def _stacked(name: str, given: Any) -> Float[Array, "..."]:
         array = jnp.asarray(given)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must hold numbers: got {type(given).__name__}.") from error
-    if jnp.issubdtype(array.dtype, jnp.integer):
+    # Whole pixels, "seen" as true or false, and half precision, which no solver works in.
+    half = jnp.issubdtype(array.dtype, jnp.floating) and jnp.finfo(array.dtype).bits < 32
+    mask = name == "confidence" and array.dtype == bool
+    if half or mask or jnp.issubdtype(array.dtype, jnp.integer):
         array = array.astype(jnp.zeros(0).dtype)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise TypeError(f"{name} must be floating-point: got dtype {array.dtype}.")
@@ -144,12 +147,16 @@ def _starts(body, start, batch, dtype) -> Variables:
     }
     found = []
     for name, (value, wanted) in rows.items():
-        array = jnp.asarray(value).astype(dtype)
+        try:
+            array = jnp.asarray(value).astype(dtype)
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"{name} must hold numbers: got {type(value).__name__}.") from error
         if name == "shape" and array.ndim and array.shape[-1] < body.num_shape:
             widths = [(0, 0)] * (array.ndim - 1) + [(0, body.num_shape - array.shape[-1])]
             array = jnp.pad(array, widths)
         if array.shape[-len(wanted) :] != wanted:
-            raise ValueError(f"{name} must have shape (..., {wanted}): got {array.shape}.")
+            sizes = ", ".join(str(size) for size in wanted)
+            raise ValueError(f"{name} must have shape (..., {sizes}): got {array.shape}.")
         if not isinstance(array, Tracer) and not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite: got values that are not.")
         array = _broadcast(name, array, (*batch, *wanted))

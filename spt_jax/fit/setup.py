@@ -112,6 +112,11 @@ def prepare_fit(
             f"camera must be a PinholeCamera: got {type(camera).__name__}; "
             "PinholeCamera.from_matrix takes a 3 x 4 matrix."
         )
+    if camera.focal.ndim != 1:
+        raise ValueError(
+            f"camera must be one: got a batch of {camera.focal.shape[:-1]}; for a camera each use "
+            "jax.vmap(lambda points, camera: fit_pose(body, points, camera, ...))."
+        )
     for name, number, least in (("starts", starts, 1), ("max_steps", max_steps, 1)):
         if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
             raise ValueError(f"{name} must be a whole number of at least {least}: got {number!r}.")
@@ -126,6 +131,18 @@ def prepare_fit(
         if not numeric or not 0 <= weight < np.inf:
             raise ValueError(f"{name} must be a finite number, not negative: got {weight!r}.")
     likely, ranges = _as_prior(body, prior), _as_limits(body, limits)
+    for name, rows in (("prior", likely and likely.mean), ("limits", ranges and ranges.low)):
+        if rows is not None and len(rows) != body.num_joints:
+            raise ValueError(
+                f"{name} must be of the body's {body.num_joints} joints: got one of {len(rows)}; "
+                "make it with body.joint_names."
+            )
+    for name, given in (("solver", solver), ("keypoint_solver", keypoint_solver)):
+        if given is not None and not isinstance(given, optx.AbstractMinimiser):
+            raise TypeError(
+                f"{name} must be an optimistix minimiser, such as optimistix.BFGS(1e-3, 1e-3): got "
+                f"{type(given).__name__}."
+            )
     # Of the body alone, and read on the host: under jit its constants would be tracers there.
     with jax.ensure_compile_time_eval():
         figure = make_figure(body, keypoint_regressor(body, joints, count=count_points(keypoints)))
