@@ -18,7 +18,6 @@ from spt_jax.fit.priors import GaussianPosePrior, JointLimits
 from spt_jax.fit.regularisers import Regulariser
 from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import Descent, descend, unpacked
-from spt_jax.host import parallel_map
 
 # Candidates whose energy is looked at before two of them go through the regularised stages.
 _LOOKED_AT = 4
@@ -199,19 +198,11 @@ def _fit_each(setup: Setup, people: Person) -> FitResult:
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((setup, people))):
         return jax.vmap(lambda person: _fit_one(setup, person))(people)
     # Under vmap every lane waits for the slowest, through each of the search's loops: eight people
-    # took 1.3 times as long as one by one. Each in its own thread ends when it is done, and while
-    # one is measured here the other's mesh goes to another process.
+    # took 1.3 times as long as one by one. Nor in threads: two of these programs at a time make
+    # XLA's CPU client wait for itself for ever (jax 0.10.2, two cores).
     count = len(people.keypoints)
     rows = [jax.tree.map(lambda leaf, k=k: leaf[k], people) for k in range(count)]
-    doubled = jax.config.jax_enable_x64
-
-    def fit(person):
-        # What a caller sets by `with jax.enable_x64()` holds in the caller's thread alone.
-        with jax.enable_x64(doubled):
-            return jax.block_until_ready(_fit_one(setup, person))
-
-    # The first by itself, so that the others find it compiled.
-    found = [fit(rows[0]), *parallel_map(fit, rows[1:])]
+    found = [_fit_one(setup, row) for row in rows]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
 
