@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -24,10 +23,6 @@ if TYPE_CHECKING:
 
 Named = Literal["spt", "none", "spheres", "laplacian"]
 
-# People fitted side by side. More take more memory and wait for the slowest of them; a file's last
-# batch is filled up, so that everything compiles once.
-_BATCH = 16
-
 # Detectors make mistakes, and a square counts one of them for more than all the rest. Mean joint
 # error of 24 motion-capture frames with 5 pixels of noise (2 % of the person), when none, one or
 # two of the 17 keypoints are off by 20 to 50 % of the person: 70, 200, 279 mm with plain squares;
@@ -35,7 +30,7 @@ _BATCH = 16
 # takes good points of unusual poses for mistakes: in 11 of 48 people who were seen in part, where
 # this scale did in 2.
 _ROBUST_SHARE = 0.1
-_SIDE = 1000.0
+_LEAST_SCALE = 5.0  # pixels, of somebody of whom a point or two are seen
 
 _LARGEST_CANVAS = 2000  # pixels of a side, where there is no photograph
 _CUBIC_CENTIMETRES = 1e6
@@ -56,7 +51,7 @@ class Fitted:
     status: int
     reason: str
     steps: int
-    seconds: float  # its share of the batch
+    seconds: float
     overlap: IntersectionReport | None = field(repr=False)
 
     @property
@@ -86,71 +81,45 @@ def fit_everyone(
     fit_shape: bool,
     state: State,
 ) -> list[Fitted]:
-    """Fit all people, in batches of one layout each, and measure the bodies' overlaps."""
-    found: dict[str, Fitted] = {}
-    for layout in dict.fromkeys(one.person.layout for one in people):
-        alike = [one for one in people if one.person.layout == layout]
-        size = min(len(alike), _BATCH)
-        for first in range(0, len(alike), size):
-            batch = alike[first : first + size]
-            what = batch[0].name if len(batch) == 1 else f"{len(batch)} people"
-            new = "compiling, which takes 10 to 40 s, then " if first == 0 else ""
-            state(f"{new}fitting {what} ({layout})", done=len(found))
-            start = time.perf_counter()
-            result, scales = _fit_batch(body, batch, size, layout, regulariser, robust, fit_shape)
-            seconds = (time.perf_counter() - start) / len(batch)
-            state(f"measuring {what}")
-            for k, one in enumerate(batch):
-                found[one.name] = _as_fitted(body, one, result, k, float(scales[k]), seconds)
-    return [found[one.name] for one in people]
+    """Fit everyone in turn, and measure the bodies' overlaps.
 
-
-def _fit_batch(
-    body: "BodyModel",
-    batch: Sequence[Annotated],
-    size: int,
-    layout: str,
-    regulariser: Named,
-    robust: "float | Literal['auto', 'off']",
-    fit_shape: bool,
-) -> "tuple[FitResult, Float[np.ndarray, 'N']]":
+    One by one, so that each may have a camera and the bar moves on; it compiles once a layout.
+    """
     from spt_jax.fit import pose as fitting
+    from spt_jax.fit.regularisers import as_regulariser
 
-    filled = [*batch, *[batch[-1]] * (size - len(batch))]
-    points = np.stack([one.person.points for one in filled])
-    trust = np.stack([one.person.confidence for one in filled])
-    scales = np.ones(size)
-    if robust == "auto":
-        # A pixel's size is free as long as the camera has the same: with every person as many
-        # pixels tall, one scale in pixels is the same share of each.
-        sides = np.array([_box_side(one) for one in filled])
-        scales = np.where(sides >= 1, _SIDE / np.maximum(sides, 1), 1.0)
-    cameras = [_scaled(one.camera, scale) for one, scale in zip(filled, scales, strict=True)]
-    scale = None if robust == "off" else _ROBUST_SHARE * _SIDE if robust == "auto" else robust
-
-    def one_person(points, trust, camera):
-        return fitting.fit_pose(
+    prepared = as_regulariser(regulariser).prepared(body, 1)
+    found, compiled = [], set()
+    for k, one in enumerate(people):
+        person = one.person
+        new = person.layout not in compiled
+        compiled.add(person.layout)
+        state(f"{one.name}: {'compiling (10 to 40 s), then ' if new else ''}fitting", done=k)
+        start = time.perf_counter()
+        result = fitting.fit_pose(
             body,
-            points,
-            camera,
-            joints=layout,
-            confidence=trust,
-            regulariser=regulariser,
-            robust=scale,
+            person.points.astype(np.float32),
+            one.camera,
+            joints=person.layout,
+            confidence=person.confidence.astype(np.float32),
+            regulariser=prepared,
+            robust=_robust_scale(one, robust),
             fit_shape=fit_shape,
         )
-
-    result = jax.vmap(one_person)(
-        jnp.asarray(points * scales[:, None, None], jnp.float32),
-        jnp.asarray(trust, jnp.float32),
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras),
-    )
-    return jax.tree.map(np.asarray, result), scales
+        result = jax.tree.map(np.asarray, result)
+        seconds = time.perf_counter() - start
+        state(f"{one.name}: measuring")
+        found.append(_as_fitted(body, one, result, seconds))
+    return found
 
 
-def _box_side(one: Annotated) -> float:
+def _robust_scale(one: Annotated, robust: "float | Literal['auto', 'off']") -> float | None:
+    if robust == "off":
+        return None
+    if robust != "auto":
+        return robust
     seen = one.person.points[one.person.confidence > 0]
-    return float(np.ptp(seen, axis=0).max())
+    return max(_ROBUST_SHARE * float(np.ptp(seen, axis=0).max()), _LEAST_SCALE)
 
 
 def _scaled(camera: Any, scale: float) -> Any:
@@ -160,29 +129,26 @@ def _scaled(camera: Any, scale: float) -> Any:
     return PinholeCamera(*(np.asarray(part, np.float32) for part in parts), near=camera.near)
 
 
-def _as_fitted(
-    body: "BodyModel", one: Annotated, result: Any, k: int, scale: float, seconds: float
-) -> Fitted:
+def _as_fitted(body: "BodyModel", one: Annotated, result: "FitResult", seconds: float) -> Fitted:
     from spt_jax.report import intersection_report
 
-    vertices = result.vertices[k]
+    vertices = np.asarray(result.vertices)
     overlap = None
     if np.isfinite(vertices).all():
         overlap = intersection_report(vertices, body.faces, folds=body.rest_surface)
-    root = np.asarray(one.camera.to_camera(jnp.asarray(result.joints[k, :1])))[0]
-    reason = result.reason
+    root = np.asarray(one.camera.to_camera(result.joints[:1]))[0]
     return Fitted(
         given=one,
-        pose=result.pose[k],
-        shape=result.shape[k],
-        translation=result.translation[k],
+        pose=np.asarray(result.pose),
+        shape=np.asarray(result.shape),
+        translation=np.asarray(result.translation),
         vertices=vertices,
-        keypoints=result.keypoints[k] / scale,
+        keypoints=np.asarray(result.keypoints),
         distance=float(root[2]),
-        terms={name: float(value[k]) for name, value in result.terms.items()},
-        status=int(result.status[k]),
-        reason=reason[k],
-        steps=int(result.steps[k]),
+        terms={name: float(value) for name, value in result.terms.items()},
+        status=int(result.status),
+        reason=result.reason,
+        steps=int(result.steps),
         seconds=seconds,
         overlap=overlap,
     )
@@ -235,7 +201,7 @@ def summary(people: Sequence[Fitted]) -> str:
     seconds = np.mean([one.seconds for one in bodies])
     return (
         f"{count}: points {np.median(errors):.1f} pixels off (median), {overlap:.2f} cm³ of "
-        f"overlap in all, {seconds:.1f} s each with compiling"
+        f"overlap in all, {seconds:.1f} s each, compiling included"
     )
 
 
