@@ -50,7 +50,7 @@ class Workers:
 
     def measure_one(
         self, function: Function, options: Hashable, mesh: Mesh, map_tasks: Callable[..., Any]
-    ) -> tuple[np.ndarray, ...]:
+    ) -> tuple[Any, ...]:
         """The function of one mesh: here, or elsewhere while another thread measures here."""
         with self._lock:
             alone = self._at_work == 0
