@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -70,6 +71,22 @@ def scenes(first: int, count: int, seed: int) -> Iterator[Scene]:
             yield scene
         if found == first + count:
             return
+
+
+def stored_scenes(path: Path | None, first: int, count: int, seed: int) -> list[Scene]:
+    """The same scenes, from a file that holds them, or made and written there; None for neither."""
+    if path is not None and path.exists():
+        with np.load(path, allow_pickle=False) as data:
+            rows = zip(*(data[name] for name in Scene._fields), strict=True)
+            found = [Scene(str(name), *arrays) for name, *arrays in rows]
+        if len(found) >= first + count:
+            return found[first : first + count]
+    found = list(scenes(0, first + count, seed))
+    if path is not None:
+        np.savez(
+            path, **{name: np.stack([getattr(s, name) for s in found]) for name in Scene._fields}
+        )
+    return found[first:]
 
 
 def prior_without(motion: str) -> GaussianPosePrior:

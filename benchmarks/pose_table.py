@@ -22,7 +22,7 @@ import optimistix as optx
 import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
-from benchmarks.pose_scenes import JOINTS, Scene, camera, prior_without, scenes
+from benchmarks.pose_scenes import JOINTS, Scene, camera, prior_without, stored_scenes
 from spt_jax import classify_vertices, fit_pose, load_body
 from spt_jax.fit.regularisers import Laplacian, Nothing, Regulariser, SelfIntersection, Spheres
 
@@ -39,10 +39,10 @@ WEIGHTS = {
     "RE + SPT": (1.0, 1.0),
 }
 TRIED = {
-    "RE + LR": (0.03, 0.1, 0.3, 1.0, 3.0, 10.0),
-    "RE + SA": (0.03, 0.1, 0.3, 1.0, 3.0, 10.0),
-    "RE + SPT, paper": (1e-5, 1e-4, 1e-3, 1e-2),
-    "RE + SPT": (0.03, 0.1, 0.3, 1.0, 3.0),
+    "RE + LR": (0.1, 1.0, 10.0, 100.0),
+    "RE + SA": (0.1, 0.3, 1.0, 3.0, 10.0),
+    "RE + SPT, paper": (1e-5, 1e-4, 1e-3),
+    "RE + SPT": (0.1, 1.0, 10.0),
 }
 OBJECTIVES = ("keypoints alone", "prior and limits")
 CONDITIONS = ("exact joints", "5 px noise, 10 % missing")
@@ -63,6 +63,8 @@ class Settings:
     seed: int = 0
     cache: Path | None = None
     """An .npz of what has been fitted already; read where it exists, and written."""
+    scenes: Path | None = None
+    """An .npz of the scenes; read where it exists, and written."""
     record: bool = False
     """Write the tables into results.md."""
 
@@ -249,7 +251,7 @@ HEADER = (
 
 def tables(settings: Settings) -> list[Table]:
     """The table's four blocks."""
-    some = list(scenes(0, settings.frames, settings.seed))
+    some = stored_scenes(settings.scenes, 0, settings.frames, settings.seed)
     cache = Cache(settings.cache)
     made = []
     blocks = [(o, c) for o in settings.objectives for c in settings.conditions]
@@ -264,7 +266,7 @@ def tables(settings: Settings) -> list[Table]:
 
 def tuning(settings: Settings) -> list[Table]:
     """Errors on scenes that the table does not have, by weight."""
-    some = list(scenes(TABLE_SCENES, settings.frames, settings.seed))
+    some = stored_scenes(settings.scenes, TABLE_SCENES, settings.frames, settings.seed)
     cache = Cache(settings.cache)
     made = []
     for objective in settings.objectives:

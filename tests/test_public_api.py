@@ -6,8 +6,12 @@ import spt_jax
 
 NAMES = [
     "BodyModel",
+    "FitResult",
     "IntersectionReport",
+    "KeypointRegressor",
     "MeshCheck",
+    "PeopleResult",
+    "PinholeCamera",
     "PosedBody",
     "RestSurface",
     "Scene",
@@ -17,11 +21,15 @@ NAMES = [
     "between_groups",
     "check_mesh",
     "classify_vertices",
+    "fit_people",
+    "fit_pose",
     "intersection_report",
     "join_bodies",
+    "keypoint_regressor",
     "load_body",
     "load_mocap",
     "paper_penalty",
+    "read_keypoints",
     "self_intersection_penalty",
     "untangle_mesh",
     "untangle_pose",
@@ -37,6 +45,15 @@ PARAMETERS = {
     "intersection_report": "vertices, faces, *, rays='auto', directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), folds=None",
     "check_mesh": "vertices, faces",
+    "fit_pose": "body, keypoints, camera, *, joints, confidence=None, regulariser='spt', pose=None,"
+    " shape=None, translation=None, fit_shape=False, fit_translation=True, prior='mocap',"
+    " limits='anatomical', prior_weight=1.0, limits_weight=1.0, shape_weight=1.0,"
+    " upright_weight=0.25, expected_error=None, robust=None, starts=6, solver=None,"
+    " keypoint_solver=None, max_steps=20",
+    "fit_people": "body, keypoints, camera, *, joints, weights=(0.1, 1.0, 10.0), margin=0.002,"
+    " max_steps=25, **options",
+    "keypoint_regressor": "body, joints, *, count=None, names=None",
+    "read_keypoints": "path, *, layout=None",
     "load_body": "source='anny', *, num_shape=10, dtype=None",
     "load_mocap": "",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore', margin=0.002,"

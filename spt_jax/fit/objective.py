@@ -1,5 +1,6 @@
 """What a fit minimises before any regulariser: keypoints, prior, limits, as a sum of squares."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,6 +21,10 @@ _RIDGE = 1e-3
 # Added to the Gauss-Newton matrix whose factor the penalty's stages take as coordinates, per
 # squared radian: directions that the keypoints say nothing about would else be endlessly long.
 _STIFFNESS = 1.0
+
+
+# The scale of the robust loss while starts are tried, in units of the one that counts.
+_FORGIVING = 4.0
 
 
 class Weights(NamedTuple):
@@ -61,6 +66,15 @@ class Objective(eqx.Module):
     start: Variables  # of the whole body
     fit_shape: bool = eqx.field(static=True)
     fit_translation: bool = eqx.field(static=True)
+
+    def forgiving(self) -> "Objective":
+        """With a wider Geman-McClure scale, for a search.
+
+        From far away every keypoint looks like a mistake, and a narrow scale lets go of all.
+        """
+        if self.robust is None:
+            return self
+        return dataclasses.replace(self, robust=_FORGIVING * self.robust)
 
     @property
     def names(self) -> tuple[str, ...]:

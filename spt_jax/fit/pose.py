@@ -209,7 +209,7 @@ def _fit_each(setup: Setup, people: Person) -> FitResult:
 @eqx.filter_jit
 def _fit_one(setup: Setup, person: Person) -> FitResult:
     objective = setup.objective(person)
-    candidates = setup.candidates(objective)
+    candidates = setup.candidates(objective.forgiving())
     alone = jax.tree.map(lambda leaf: leaf[None], objective)
     weights = setup.regulariser.weights.astype(candidates.vectors.dtype)
 
