@@ -13,7 +13,7 @@ from spt_jax.fit.objective import Objective
 from spt_jax.fit.starts import orientation_starts
 
 # Two fits whose variables agree to this, in radians and metres, are the same fit found twice.
-_SAME = 0.05
+_SAME = 0.15
 
 _TRACED_BEST = 2  # candidates whose limbs are flipped
 
@@ -32,8 +32,9 @@ def find_candidates(
     starts: int,
     solver: optx.AbstractMinimiser,
     max_steps: int,
+    count: int,
 ) -> Candidates:
-    """Minima of the keypoints' objective, the best first.
+    """Different minima of the keypoints' objective, the best first.
 
     `starts` orientations are fitted; then every limb of the two best is flipped in depth, one at a
     time and three ways, and fitted; then the limbs' flips with the lowest sums of costs together.
@@ -46,10 +47,11 @@ def find_candidates(
         starts: orientations tried, and lanes of a round.
         solver: any optimistix minimiser.
         max_steps: for each fit.
+        count: how many minima to return; where fewer were found the best comes several times.
     """
     vectors, costs, steps = _rounds(objective, limbs, starts, solver, max_steps)
-    order = jnp.argsort(costs)
-    return Candidates(vectors[order], costs[order], steps)
+    best = _distinct(vectors, costs, count)
+    return Candidates(vectors[best], costs[best], steps)
 
 
 def refine_start(
@@ -73,13 +75,13 @@ def _rounds(objective, limbs, starts, solver, max_steps):
         return first
 
     def flipped(vectors, costs, chunk):
-        best = _two_best(vectors[:starts], costs[:starts])
+        best = _distinct(vectors[:starts], costs[:starts], _TRACED_BEST)
         every = jax.vmap(lambda x: limb_flips(objective, x, limbs))(vectors[best])
         padded = every.reshape(flips, -1)[np.arange(chunks * starts) % flips]
         return jax.lax.dynamic_slice_in_dim(padded, chunk * starts, starts)
 
     def combined(vectors, costs, chunk):
-        best = _two_best(vectors[:starts], costs[:starts])
+        best = _distinct(vectors[:starts], costs[:starts], _TRACED_BEST)
         rows = slice(starts, starts + flips)
         alone, found = vectors[best], costs[best]
         changed = (vectors[rows].reshape(_TRACED_BEST, -1, alone.shape[-1]),)
@@ -130,12 +132,16 @@ def _fit(objective: Objective, vector, solver, max_steps):
     return vector + back @ solution.value, jnp.asarray(solution.stats["num_steps"])
 
 
-def _two_best(vectors, costs):
-    """Of the best, and of the best of those that are not the same minimum; itself if all are."""
+def _distinct(vectors, costs, count):
+    """Of the best minima that are not the same, the best first; the best again where they end."""
     best = jnp.argmin(costs)
-    same = jnp.max(jnp.abs(vectors - vectors[best][None]), axis=-1) < _SAME
-    other = jnp.argmin(jnp.where(same, jnp.inf, costs))
-    return jnp.stack([best, jnp.where(jnp.all(same), best, other)])
+    chosen = [best]
+    for _ in range(count - 1):
+        near = jnp.max(jnp.abs(vectors - vectors[chosen[-1]]), axis=-1) < _SAME
+        costs = jnp.where(near, jnp.inf, costs)
+        following = jnp.argmin(costs)
+        chosen.append(jnp.where(jnp.isfinite(costs[following]), following, best))
+    return jnp.stack(chosen)
 
 
 def _finite(costs: Float[Array, "N"]) -> Float[Array, "N"]:

@@ -209,7 +209,7 @@ def _fit_each(setup: Setup, people: Person) -> FitResult:
 @eqx.filter_jit
 def _fit_one(setup: Setup, person: Person) -> FitResult:
     objective = setup.objective(person)
-    candidates = setup.candidates(objective.forgiving())
+    candidates = setup.candidates(objective.forgiving(), _LOOKED_AT)
     alone = jax.tree.map(lambda leaf: leaf[None], objective)
     weights = setup.regulariser.weights.astype(candidates.vectors.dtype)
 
@@ -218,13 +218,13 @@ def _fit_one(setup: Setup, person: Person) -> FitResult:
         start = jax.tree.map(lambda leaf: leaf[None], objective.start)
         return setup.regulariser.energy(setup.body, start, now)
 
-    looked = candidates.vectors[:_LOOKED_AT]
+    looked = candidates.vectors
+    costs = jax.vmap(objective.cost)(looked)
     energies = jax.vmap(energy)(looked)
     # Judged with the middle weight: with the last one, a graze that costs nothing to end would
     # count for more than a limb on the wrong side.
-    judged = candidates.costs[:_LOOKED_AT] + weights[len(weights) // 2] * energies
-    free = jnp.argmin(jnp.where(jnp.isnan(judged), jnp.inf, judged))
-    tracks = jnp.stack([looked[0], looked[free]])
+    judged = costs + weights[len(weights) // 2] * energies
+    tracks = jnp.stack([looked[_least(costs)], looked[_least(judged)]])
 
     def through_stages(vector):
         return descend(
@@ -233,9 +233,13 @@ def _fit_one(setup: Setup, person: Person) -> FitResult:
 
     ends = jax.vmap(through_stages)(tracks)
     totals = ends.cost + weights[-1] * ends.energy
-    best = jnp.argmin(jnp.where(jnp.isnan(totals), jnp.inf, totals))
+    best = _least(totals)
     end = jax.tree.map(lambda leaf: leaf[best], ends)
     return _result(setup, objective, end, candidates.steps + jnp.sum(ends.steps))
+
+
+def _least(costs: Float[Array, "N"]) -> Int[Array, ""]:
+    return jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))
 
 
 def _result(setup: Setup, objective: Objective, end: Descent, steps) -> FitResult:

@@ -62,12 +62,12 @@ class Setup(eqx.Module):
             fit_translation=self.fit_translation,
         )
 
-    def candidates(self, objective: Objective) -> Candidates:
-        """Fits to the keypoints alone, the best first."""
+    def candidates(self, objective: Objective, count: int) -> Candidates:
+        """Fits to the keypoints alone, the best first; one where a start was given."""
         if not self.starts:
             return refine_start(objective, self.keypoint_solver, 2 * _KEYPOINT_STEPS)
         return find_candidates(
-            objective, self.limbs, self.starts, self.keypoint_solver, _KEYPOINT_STEPS
+            objective, self.limbs, self.starts, self.keypoint_solver, _KEYPOINT_STEPS, count
         )
 
 
