@@ -137,7 +137,7 @@ def _distinct(vectors, costs, count):
     best = jnp.argmin(costs)
     chosen = [best]
     for _ in range(count - 1):
-        near = jnp.max(jnp.abs(vectors - vectors[chosen[-1]]), axis=-1) < _SAME
+        near = jnp.max(jnp.abs(vectors - vectors[chosen[-1]][None]), axis=-1) < _SAME
         costs = jnp.where(near, jnp.inf, costs)
         following = jnp.argmin(costs)
         chosen.append(jnp.where(jnp.isfinite(costs[following]), following, best))
