@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from helpers import embedded_body, mocap
@@ -52,7 +53,8 @@ def body_of(smpl, names):
 
 @functools.cache
 def figure(joints="smpl22"):
-    return make_figure(embedded_body(), keypoint_regressor(embedded_body(), joints))
+    with jax.ensure_compile_time_eval():  # also where a test traces
+        return make_figure(embedded_body(), keypoint_regressor(embedded_body(), joints))
 
 
 def objective(
