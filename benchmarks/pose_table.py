@@ -33,10 +33,10 @@ PAPER_RATE = 0.3  # gradient descent in coordinates in which the keypoints' cost
 # The last weight of each method, keypoints alone and with prior and limits: see --tune.
 WEIGHTS = {
     "RE": (0.0, 0.0),
-    "RE + LR": (0.3, 0.3),
+    "RE + LR": (100.0, 0.1),
     "RE + SA": (3.0, 3.0),
+    "RE + SPT": (1.0, 0.1),
     "RE + SPT, paper": (1e-3, 1e-3),
-    "RE + SPT": (1.0, 1.0),
 }
 TRIED = {
     "RE + LR": (0.1, 1.0, 10.0, 100.0),
