@@ -10,16 +10,27 @@ import jax
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_snippet_frees_the_pose():
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+def printed_by(snippet):
+    """What one of the page's Python snippets prints."""
+    code = re.findall(r"```python\n(.*?)```", README, re.DOTALL)[snippet]
     assert len([line for line in code.splitlines() if line.strip()]) <= 15
     printed = io.StringIO()
     # A newcomer's JAX promotes dtypes as it always does.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         with contextlib.redirect_stdout(printed):
             exec(compile(code, "README.md", "exec"), {})
-    before, after = map(float, re.findall(r"([\d.]+) cm\^3", printed.getvalue()))
+    return printed.getvalue()
+
+
+def test_the_first_snippet_frees_the_pose():
+    before, after = map(float, re.findall(r"([\d.]+) cm\^3", printed_by(0)))
     assert before > 300 and after < 0.05 * before
+
+
+def test_the_second_snippet_fits_a_body():
+    printed = printed_by(1)
+    assert printed.startswith("converged {")
+    assert 0 < float(re.search(r"'total': ([\d.]+)", printed)[1]) < 100
 
 
 def test_the_commands_are_marked_once():

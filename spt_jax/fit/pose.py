@@ -109,7 +109,9 @@ def fit_pose(
     each limb (a bone that leans towards the camera and its mirror image that leans away look the
     same); then with it, its weight rising from stage to stage, from the two best of these, one
     of them chosen with the regulariser in view. What ends with the lowest total is returned.
-    All of it is one compiled solve.
+    All of it is one compiled solve. The people of a batch are solved one after another, so that
+    each ends when it is done; under `vmap` they are solved side by side. Other numbers of any kind
+    do not compile anew; other counts, options and layouts do.
 
     Args:
         body: any `BodyModel`.
@@ -123,10 +125,11 @@ def fit_pose(
         confidence: (..., K), 0 for a point that was not seen; all 1 if None.
         regulariser: "spt", the self-intersection penalty; "none"; "spheres" and "laplacian", the
             rivals of the paper's section 4.4; or a `Regulariser` with weights of its own.
-        pose: where to start, (..., J, 3); then no other orientations and flips are tried.
+        pose: where to start, (..., J, 3); then no other orientations and flips are tried. Give the
+            translation, too: it starts at zero otherwise.
         shape: coefficients, (..., B); held fixed, or with `fit_shape` where to start.
         translation: in metres, (..., 3); held fixed without `fit_translation`, else found from the
-            keypoints unless `pose` is given too.
+            keypoints, or where to start if `pose` is given too.
         fit_shape: whether to fit the shape.
         fit_translation: whether to fit the translation.
         prior: "mocap", a Gaussian of the embedded motion capture; one of your own (`pose_prior`);
@@ -221,9 +224,9 @@ def _fit_one(setup: Setup, person: Person) -> FitResult:
     looked = candidates.vectors
     costs = jax.vmap(objective.cost)(looked)
     energies = jax.vmap(energy)(looked)
-    # Judged with the middle weight: with the last one, a graze that costs nothing to end would
-    # count for more than a limb on the wrong side.
-    judged = costs + weights[len(weights) // 2] * energies
+    # The best by the keypoints, and the best that is free: what a graze costs to end is only known
+    # when both have gone through the stages.
+    judged = costs + weights[-1] * energies
     tracks = jnp.stack([looked[_least(costs)], looked[_least(judged)]])
 
     def through_stages(vector):
