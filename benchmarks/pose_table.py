@@ -2,9 +2,9 @@
 
 Poses are fitted to 22 projected joints by each method, all from the same starts and with the same
 numbers of steps; `pose_scenes.py` says what the scenes are. Once the objective is the paper's, the
-keypoints and the regulariser alone, and once it has what `fit_pose` adds by default, a prior (of the
-other motions) and joint limits. `--tune` fits other scenes with rising weights; those in METHODS
-are the best that it found for each method.
+keypoints and the regulariser alone, and once it has what `fit_pose` adds by default, a prior (of
+the other motions) and joint limits. `--tune` fits other scenes with rising weights; those in
+WEIGHTS are the best that it found for each method.
 """
 
 import time
@@ -287,15 +287,16 @@ def tuning(settings: Settings) -> list[Table]:
 
 
 _METHOD = """
-Embedded body with random shape coefficients (clipped at 2), a random turn about the vertical, 3 to 5 m
-from a camera of focal length 1200 pixels; frames of motion capture whose body has no collision in
-that shape (folds aside; by the penalty and by ipctk). {joints} joints are given, the shape is known, pose
-and translation are fitted. All methods: the same six orientations and flips, then three stages of
-at most 20 steps of BFGS with a weight rising to the one shown (RE: the same stages with none; "paper":
-gradient descent on the ratio with the unit gradient, 512 x 512 rays, one direction). Means with 95 %
-bootstrap intervals; differences are paired. RE + LR: Wang et al. 2018, RE + SA: Pons-Moll et al. 2015
-with spheres fitted to the body. "Without folds": `classify_vertices(..., folds=body.rest_surface)`.
-The prior is learned from the other ten motions. Weights have the lowest mean error on other scenes.
+Embedded body with random shape coefficients (clipped at 2), a random turn about the vertical, 3 to
+5 m from a camera of focal length 1200 pixels; frames of motion capture whose body has no collision
+in that shape (folds aside; by the penalty and by ipctk). {joints} joints are given, the shape is
+known, pose and translation are fitted. All methods: the same six orientations and flips, then three
+stages of at most 20 steps of BFGS with a weight rising to the one shown (RE: the same stages with
+none; "paper": gradient descent on the ratio with the unit gradient, 512 x 512 rays, one direction).
+Means with 95 % bootstrap intervals; differences are paired. RE + LR: Wang et al. 2018, RE + SA:
+Pons-Moll et al. 2015 with spheres fitted to the body. "Without folds":
+`classify_vertices(..., folds=body.rest_surface)`. The prior is learned from the other ten motions.
+Weights have the lowest mean error on other scenes.
 """
 
 

@@ -45,7 +45,8 @@ def limb_flips(
     A bone of known length whose upper end is known meets the line of sight through its lower end
     twice; the second meeting is the bone's mirror image in the plane across that line (Sminchisescu
     and Triggs 2003, "kinematic jumps"). The bone turns there by the smallest rotation; what hangs
-    below a flipped bone keeps its orientation in the world, so that it looks the same too.
+    below a flipped bone keeps its orientation in the world, so that it looks the same too, up to
+    the change of perspective with its new depth, which is left to the solver.
     """
     body, camera, moved = objective.figure.body, objective.camera, objective.moved(vector)
     dtype = vector.dtype
