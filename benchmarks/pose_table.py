@@ -310,6 +310,8 @@ def main(settings: Settings) -> None:
         name = "pose_tuning" if settings.tune else "pose_table"
         title = "Poses from 2D joints: weights" if settings.tune else "Poses from 2D joints"
         command = "python -m benchmarks.pose_table" + (" --tune" if settings.tune else "")
+        if tuple(settings.objectives) != OBJECTIVES:
+            command += " --objectives " + " ".join(f'"{name}"' for name in settings.objectives)
         body = [provenance(f"{command} --record"), _METHOD.strip().format(joints=JOINTS)]
         record_section(name, title, "\n\n".join([*body, *(one.markdown() for one in found)]))
 
