@@ -149,7 +149,12 @@ class PinholeCamera(eqx.Module):
 
     @classmethod
     def from_field_of_view(
-        cls, width: float, height: float, degrees: float = 55.0, *, near: float = 0.1
+        cls,
+        width: float | int,
+        height: float | int,
+        degrees: float | int = 55.0,
+        *,
+        near: float | int = 0.1,
     ) -> "PinholeCamera":
         """A camera for an image whose own is not known: at the origin, looking along z.
 

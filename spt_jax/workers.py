@@ -59,14 +59,16 @@ class Workers:
         try:
             size = len(mesh[1])
             work = packed(function, options) if not alone and size > _WORTH_ASKING else None
-            for worker in () if work is None else self._ready(work, 1):
-                try:
-                    found = worker.measure(work, mesh, _PATIENCE[0] + 1e-6 * _PATIENCE[1] * size)
-                except LostError:
-                    self._drop(worker)
-                else:
-                    self._release(worker)
-                    return found
+            if work is not None:
+                patience = _PATIENCE[0] + 1e-6 * _PATIENCE[1] * size
+                for worker in self._ready(work, 1):
+                    try:
+                        found = worker.measure(work, mesh, patience)
+                    except LostError:
+                        self._drop(worker)
+                    else:
+                        self._release(worker)
+                        return found
             return function(*mesh, options, map_tasks)
         finally:
             with self._lock:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -194,7 +195,7 @@ class Laplacian(Regulariser):
         return jnp.sum(laplacian_penalty(self.laplacian, reference, own_frame(now))) * 1e6
 
 
-NAMED: dict[str, type[Regulariser]] = {
+NAMED: dict[str, Callable[[], Regulariser]] = {
     kind.name: kind for kind in (Nothing, SelfIntersection, Spheres, Laplacian)
 }
 
