@@ -23,7 +23,7 @@ from spt_jax.groups import between_groups, join_bodies, within_groups
 from spt_jax.report import intersection_report
 
 # What is tried where people still cross: the margin, times this, with the last weight again.
-_WIDER = (2.0, 4.0)
+_WIDER = (2.0, 4.0, 8.0)
 
 
 class Penetration(eqx.Module):
@@ -72,7 +72,7 @@ def fit_people(
     Each is fitted alone by `fit_pose`; then all of their parameters together minimise the sum of
     their objectives and the overlap of the whole scene, between and within people, its weight
     rising. Where triangles of two people, or of two parts of one, still cross, the last weight is
-    tried again with two and four times the margin.
+    tried again with two, four and eight times the margin.
 
     Args:
         body: any `BodyModel`.
