@@ -50,8 +50,8 @@ PARAMETERS = {
     " limits='anatomical', prior_weight=1.0, limits_weight=1.0, shape_weight=1.0,"
     " upright_weight=0.25, expected_error=None, robust=None, starts=6, solver=None,"
     " keypoint_solver=None, max_steps=20",
-    "fit_people": "body, keypoints, camera, *, joints, weights=(0.1, 1.0, 10.0), margin=0.002,"
-    " max_steps=25, **options",
+    "fit_people": "body, keypoints, camera, *, joints, weights=(0.01, 0.1, 1.0, 10.0, 100.0),"
+    " margin=0.002, max_steps=25, **options",
     "keypoint_regressor": "body, joints, *, count=None, names=None",
     "read_keypoints": "path, *, layout=None",
     "load_body": "source='anny', *, num_shape=10, dtype=None",

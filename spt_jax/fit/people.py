@@ -62,7 +62,7 @@ def fit_people(
     camera: PinholeCamera,
     *,
     joints: Any,
-    weights: Any = (0.1, 1.0, 10.0),
+    weights: Any = (0.01, 0.1, 1.0, 10.0, 100.0),
     margin: float = 0.002,
     max_steps: int = 25,
     **options: Any,
@@ -138,7 +138,7 @@ def fit_people(
             setup.regulariser, margin=jnp.asarray(attempt), weights=rising
         )
         fits, taken = _descend_together(
-            dataclasses.replace(setup, regulariser=changed), people, fits
+            dataclasses.replace(setup, regulariser=changed), people, best
         )
         steps = steps + taken
         found = _penetration(body, fits)
