@@ -9,8 +9,8 @@ from spt_jax.classes import VertexClasses as VertexClasses
 from spt_jax.classes import classify_vertices as classify_vertices
 from spt_jax.fit.people import PeopleResult as PeopleResult
 from spt_jax.fit.people import fit_people as fit_people
-from spt_jax.fit.pose import FitResult as FitResult
 from spt_jax.fit.pose import fit_pose as fit_pose
+from spt_jax.fit.result import FitResult as FitResult
 from spt_jax.groups import Scene as Scene
 from spt_jax.groups import between_groups as between_groups
 from spt_jax.groups import join_bodies as join_bodies

@@ -12,6 +12,7 @@ from spt_jax.body import BodyModel
 from spt_jax.fit.figure import Variables, make_figure
 from spt_jax.fit.objective import Objective, Weights
 from spt_jax.fit.priors import joint_limits, pose_prior
+from spt_jax.fit.viewer import Viewer
 
 # World with y up, and a camera that looks along -z from 4 m away, a metre above the floor.
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
@@ -81,7 +82,7 @@ def objective(
     trust = jnp.ones(len(keypoints)) if confidence is None else jnp.asarray(confidence)
     return Objective(
         figure=part,
-        camera=eye,
+        viewer=Viewer.of(eye),
         keypoints=keypoints,
         confidence=trust.astype(dtype),
         pixels=jnp.asarray(pixels, dtype),
@@ -89,7 +90,6 @@ def objective(
         prior=prior.of_joints(part.moving),
         limits=joint_limits(body.joint_names).of_joints(part.moving),
         weights=Weights(*(jnp.asarray(weight, dtype) for weight in weights)),
-        up=eye.rotation.astype(dtype).T @ jnp.array([0.0, -1.0, 0.0], dtype),
         start=Variables(*(jnp.asarray(part).astype(dtype) for part in start)),
         fit_shape=fit_shape,
         fit_translation=fit_translation,

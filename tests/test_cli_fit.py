@@ -13,7 +13,7 @@ from spt_jax.body.pose_files import read_poses
 from spt_jax.cli import main
 from spt_jax.commands import fitted
 from spt_jax.commands.annotated import read_camera, select_people
-from spt_jax.fit.pose import FitResult
+from spt_jax.fit.result import FitResult
 from spt_jax.keypoints import LAYOUTS
 from spt_jax.show.overlay import read_image
 

@@ -25,12 +25,13 @@ NAMES = (
     "run/0010",
     "dance_a/0040",
     "jump/0020",
-    "punch/0017",  # as fitted without a regulariser it collides, and so does the next
+    "punch/0017",
     "crawl/0092",
     "walk/0020",
     "spinkick/0030",
 )
-COLLIDING = [4, 5]
+# As fitted without a regulariser these collide.
+COLLIDING = ("punch/0017", "punch/0012")
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +109,7 @@ def test_bodies_move_with_the_camera_and_the_size_of_the_image(people, plain):
     off = np.linalg.norm(found.vertices - moved, axis=-1).mean(axis=-1)
     # Where two minima cost the same, rounding chooses; most people have one.
     assert (off < 0.01).sum() >= 6
-    close = np.isclose(found.terms["total"], plain.terms["total"], rtol=0.1, atol=0.5)
-    assert close.sum() >= 7
+    np.testing.assert_allclose(found.terms["total"], plain.terms["total"], rtol=0.1, atol=0.5)
 
 
 def test_order_of_people_a_list_and_what_was_not_seen(people, plain):
@@ -183,20 +183,19 @@ def overlap(found):
     ]
 
 
-def test_the_penalty_frees_bodies_that_collide(people, plain):
+def test_the_penalty_frees_bodies_that_collide():
     """The default, as users call it."""
-    _, _, keypoints = people
-    found = fit_pose(embedded_body(), keypoints[COLLIDING], camera(), joints="smpl")
-    before = overlap(jax.tree.map(lambda leaf: leaf[np.array(COLLIDING)], plain))
-    after = overlap(found)
-    assert max(before) > 100  # cm^3
+    keypoints = np.asarray(seen(frames(*COLLIDING)))
+    found = fit_pose(embedded_body(), keypoints, camera(), joints="smpl")
+    before, after = overlap(fit(keypoints)), overlap(found)
+    assert min(before) > 1  # cm^3
     assert max(after) < 0.2
     assert (found.terms["spt"] < 1).all()
     np.testing.assert_allclose(
         found.terms["total"], sum(v for k, v in found.terms.items() if k != "total"), rtol=1e-5
     )
     # What it costs in the image is little.
-    assert np.linalg.norm(found.keypoints - keypoints[COLLIDING], axis=-1).mean() < 4
+    assert np.linalg.norm(found.keypoints - keypoints, axis=-1).mean() < 4
 
 
 class Crouch(Regulariser):

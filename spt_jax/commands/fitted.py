@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spt_jax.body import BodyModel
-    from spt_jax.fit.pose import FitResult
+    from spt_jax.fit.result import FitResult
 
 Named = Literal["spt", "none", "spheres", "laplacian"]
 

@@ -48,17 +48,16 @@ def limb_flips(
     below a flipped bone keeps its orientation in the world, so that it looks the same too, up to
     the change of perspective with its new depth, which is left to the solver.
     """
-    body, camera, moved = objective.figure.body, objective.camera, objective.moved(vector)
+    body, moved = objective.figure.body, objective.moved(vector)
     dtype = vector.dtype
     rest = blend_shapes(body.joint_template, body.joint_shape_basis, moved.shape, dtype)
     world, at = forward_kinematics(matrix_from_axis_angle(moved.pose), rest, body.parents)
     at = at + moved.translation[None]
-    eye = -camera.rotation.astype(dtype).T @ camera.translation.astype(dtype)
 
     def flipped(above, first, middle, last, upper, lower):
         identity = jnp.eye(3, dtype=dtype)
-        thigh = jnp.where(upper, _mirroring(eye, at[first], at[middle]), identity)
-        shin = jnp.where(lower, _mirroring(eye, at[middle], at[last]), identity)
+        thigh = jnp.where(upper, _mirroring(at[first], at[middle]), identity)
+        shin = jnp.where(lower, _mirroring(at[middle], at[last]), identity)
         first_world, middle_world = thigh @ world[first], shin @ world[middle]
         pose = moved.pose.at[first].set(_relative(world[above], first_world))
         pose = pose.at[middle].set(_relative(first_world, middle_world))
@@ -73,11 +72,9 @@ def _relative(parent: Float[Array, "3 3"], child: Float[Array, "3 3"]) -> Float[
     return axis_angle_from_matrix(parent.T @ child)
 
 
-def _mirroring(
-    eye: Float[Array, "3"], start: Float[Array, "3"], end: Float[Array, "3"]
-) -> Float[Array, "3 3"]:
+def _mirroring(start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The smallest rotation that takes a bone to its mirror image across the line of sight."""
-    bone, sight = _unit(end - start), _unit(end - eye)
+    bone, sight = _unit(end - start), _unit(end)  # the viewer is at the origin
     image = bone - 2 * jnp.dot(bone, sight) * sight
     axis = jnp.cross(bone, image)
     x, y, z = axis

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -130,6 +131,11 @@ def _expected_pixels(points, trust, expected_error) -> Float[Array, "people"]:
     if expected_error is not None:
         pixels = as_positive("expected_error", expected_error)
         return jnp.full(points.shape[0], pixels, points.dtype)
+    return _share_of_size(points, trust)
+
+
+@jax.jit
+def _share_of_size(points, trust):
     seen = trust[..., None] > 0
     low = jnp.min(jnp.where(seen, points, jnp.inf), axis=1)
     high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=1)

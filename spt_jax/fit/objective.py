@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from spt_jax.body.rotations import matrix_from_axis_angle
-from spt_jax.camera import PinholeCamera
 from spt_jax.fit.figure import Figure, Variables
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits
+from spt_jax.fit.viewer import Viewer
 
 # Per squared radian (and squared unit of shape) away from the start. It decides where nothing else
 # does, as for the twist of a limb without a prior; a radian costs as much as one keypoint that is
@@ -47,14 +47,15 @@ class Objective(eqx.Module):
         + prior weight * Mahalanobis distance^2 of the pose
         + limits weight * sum of (angle beyond its range / 0.1 rad)^2
         + shape weight * |shape|^2
-        + upright weight * |body's up - up|^2.
+        + upright weight * |body's up - the image's|^2.
 
     The variables of a solver are the rotations of the joints that move, then the translation and
-    the shape where they are fitted, in one vector.
+    the shape where they are fitted, in one vector, in the viewer's axes; `pack` and `unpack` go
+    from the world to there and back.
     """
 
     figure: Figure
-    camera: PinholeCamera
+    viewer: Viewer
     keypoints: Float[Array, "K 2"]
     confidence: Float[Array, "K"]
     pixels: Float[Array, ""]  # s, the expected error
@@ -62,8 +63,7 @@ class Objective(eqx.Module):
     prior: GaussianPosePrior | None  # of the joints that move
     limits: JointLimits | None  # likewise
     weights: Weights
-    up: Float[Array, "3"]
-    start: Variables  # of the whole body
+    start: Variables  # of the whole body, in the world
     fit_shape: bool = eqx.field(static=True)
     fit_translation: bool = eqx.field(static=True)
 
@@ -82,24 +82,28 @@ class Objective(eqx.Module):
         return self.figure.regressor.names
 
     def pack(self, variables: Variables) -> Float[Array, "D"]:
-        """The vector of what is fitted."""
-        return self.repacked(variables._replace(pose=variables.pose[self.figure.rows]))
+        """The vector of a body in the world."""
+        seen = self.viewer.from_world(self.figure.body, variables)
+        return self.repacked(seen._replace(pose=seen.pose[self.figure.rows]))
 
     def unpack(self, vector: Float[Array, "D"]) -> Variables:
-        """The whole body's parameters: those of the vector, and those that are held fixed."""
-        moved = self.moved(vector)
-        return moved._replace(pose=self.start.pose.at[self.figure.rows].set(moved.pose))
+        """The whole body in the world: what the vector holds, and what is held fixed."""
+        moved = self.viewer.to_world(self.figure.body, self.moved(vector))
+        found = moved._replace(pose=self.start.pose.at[self.figure.rows].set(moved.pose))
+        return found if self.fit_translation else found._replace(translation=self.start.translation)
 
     def moved(self, vector: Float[Array, "D"]) -> Variables:
-        """The figure's parameters: of the joints that move alone."""
+        """The figure's parameters, of the joints that move alone, in the viewer's axes."""
         end = 3 * len(self.figure.moving)
         pose = vector[:end].reshape(-1, 3)
         translation, shape = self.start.translation, self.start.shape
-        if self.fit_translation:
-            translation, end = vector[end : end + 3], end + 3
         if self.fit_shape:
-            shape = vector[end:]
-        return Variables(pose, shape, translation)
+            shape = vector[len(vector) - len(shape) :]
+        if self.fit_translation:
+            return Variables(pose, shape, vector[end : end + 3])
+        # Fixed in the world; in the viewer's axes it depends on where the root is, so on the shape.
+        at = self.viewer.from_world(self.figure.body, Variables(pose, shape, translation))
+        return at._replace(pose=pose)
 
     def repacked(self, moved: Variables) -> Float[Array, "D"]:
         """The vector of the figure's parameters."""
@@ -112,7 +116,7 @@ class Objective(eqx.Module):
 
     def project(self, vector: Float[Array, "D"]) -> Float[Array, "K 2"]:
         """The keypoints of the body in the image, in pixels."""
-        return self.camera.project(self.figure.points_and_joints(self.moved(vector))[0])
+        return self.viewer.camera.project(self.figure.points_and_joints(self.moved(vector))[0])
 
     def residuals(self, vector: Float[Array, "D"]) -> dict[str, Array]:
         """The terms' residuals, whose squares sum to the cost; `ridge` is not among the terms."""
@@ -129,7 +133,7 @@ class Objective(eqx.Module):
         if self.fit_shape:
             found["shape"] = jnp.sqrt(self.weights.shape) * moved.shape
         found["upright"] = jnp.sqrt(self.weights.upright) * (
-            matrix_from_axis_angle(moved.pose[0])[:, 1] - self.up
+            matrix_from_axis_angle(moved.pose[0])[:, 1] - jnp.array([0.0, 1.0, 0.0], vector.dtype)
         )
         ridge = jnp.sqrt(_RIDGE) * (vector - self.pack(self.start))
         if self.fit_translation:

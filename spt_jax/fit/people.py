@@ -15,8 +15,9 @@ from spt_jax.arguments import as_margin
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
 from spt_jax.fit.inputs import Person
-from spt_jax.fit.pose import FitResult, fit_pose
+from spt_jax.fit.pose import fit_pose
 from spt_jax.fit.regularisers import SelfIntersection, as_weights
+from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import descend
 from spt_jax.groups import between_groups, join_bodies, within_groups
@@ -153,28 +154,15 @@ def fit_people(
 def _descend_together(
     setup: Setup, people: Person, fits: FitResult
 ) -> tuple[FitResult, Int[Array, ""]]:
-    objectives = jax.vmap(setup.objective)(people)
+    objectives = jax.vmap(setup.search.objective)(people)
     vectors = jax.vmap(
         lambda one, pose, shape, translation: one.pack(
             one.start._replace(pose=pose, shape=shape, translation=translation)
         )
     )(objectives, fits.pose, fits.shape, fits.translation)
     end = descend(setup.regulariser, setup.body, objectives, vectors, setup.solver, setup.max_steps)
-    now = jax.vmap(lambda one, x: one.unpack(x))(objectives, end.vectors)
-    posed = setup.body(now.pose, now.shape, now.translation)
-    terms = jax.vmap(lambda one, x: one.costs(x))(objectives, end.vectors)
-    del terms["ridge"]
-    terms["total"] = sum(terms.values(), jnp.zeros(len(end.vectors), end.vectors.dtype))
-    found = FitResult(
-        pose=now.pose,
-        shape=now.shape,
-        translation=now.translation,
-        vertices=posed.vertices,
-        joints=posed.joints,
-        keypoints=jax.vmap(lambda one, x: one.project(x))(objectives, end.vectors),
-        steps=fits.steps,
-        terms=terms,
-        status=jnp.where(end.converged, 0, jnp.ones_like(fits.status)),
+    found = jax.vmap(lambda *one: fit_result(setup.body, *one[:2], {}, end.converged, one[2]))(
+        objectives, end.vectors, fits.steps
     )
     return found, end.steps
 

@@ -5,68 +5,22 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
+from spt_jax.fit.candidates import Candidates
 from spt_jax.fit.inputs import Person
-from spt_jax.fit.objective import Objective
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits
 from spt_jax.fit.regularisers import Regulariser
-from spt_jax.fit.setup import Setup, prepare_fit
-from spt_jax.fit.stages import Descent, descend, unpacked
+from spt_jax.fit.result import FitResult, fit_result
+from spt_jax.fit.setup import Search, Setup, prepare_fit
+from spt_jax.fit.stages import descend, unpacked
 
 # Candidates whose energy is looked at before two of them go through the regularised stages.
 _LOOKED_AT = 4
-
-_REASONS = (
-    "converged",
-    "stopped at the largest number of steps",
-    "not finite: keypoints or camera are unusable",
-    "no keypoint was seen: this is where the fit started",
-)
-
-
-class FitResult(eqx.Module):
-    """What `fit_pose` found.
-
-    Attributes:
-        pose: axis-angle of every joint, in radians.
-        shape: shape coefficients, those given where they were not fitted.
-        translation: in metres.
-        vertices, joints: the body, in metres, in the world of the camera.
-        keypoints: where the body's keypoints are in the image, in pixels.
-        steps: of the solvers, over all starts and stages.
-        terms: what each term costs at the end: "reprojection", "prior", "limits", "shape",
-            "upright" and the regulariser's name, weighted, those that were used; their sum is
-            "total". `fit_pose` says what they are.
-        status: 0 converged; 1 stopped at the largest number of steps; 2 not finite; 3 no keypoint
-            was seen. `reason` says it in words.
-    """
-
-    pose: Float[Array, "*batch J 3"]
-    shape: Float[Array, "*batch B"]
-    translation: Float[Array, "*batch 3"]
-    vertices: Float[Array, "*batch V 3"]
-    joints: Float[Array, "*batch J 3"]
-    keypoints: Float[Array, "*batch K 2"]
-    steps: Int[Array, "*batch"]
-    terms: dict[str, Float[Array, "*batch"]]
-    status: Int[Array, "*batch"]
-
-    @property
-    def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the last stage ended at a minimum."""
-        return self.status == 0
-
-    @property
-    def reason(self) -> Any:
-        """The status in words: a string, or nested lists of strings over the batch axes."""
-        words = np.array(_REASONS, dtype=object)[np.asarray(self.status)]
-        return words if isinstance(words, str) else words.tolist()
 
 
 def fit_pose(
@@ -109,7 +63,7 @@ def fit_pose(
     each limb (a bone that leans towards the camera and its mirror image that leans away look the
     same); then with it, its weight rising from stage to stage, from the two best of these, one
     of them chosen with the regulariser in view. What ends with the lowest total is returned.
-    All of it is one compiled solve. The people of a batch are solved one after another, so that
+    All of it is compiled. The people of a batch are solved one after another, so that
     each ends when it is done; under `vmap` they are solved side by side. Other numbers of any kind
     do not compile anew; other counts, options and layouts do.
 
@@ -209,20 +163,30 @@ def _fit_each(setup: Setup, people: Person) -> FitResult:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
 
-@eqx.filter_jit
 def _fit_one(setup: Setup, person: Person) -> FitResult:
-    objective = setup.objective(person)
-    candidates = setup.candidates(objective.forgiving(), _LOOKED_AT)
+    # Two programs: fits with different regularisers share the first, which takes longer to compile.
+    return _regularise(setup, person, _searched(setup.search, person))
+
+
+@eqx.filter_jit
+def _searched(search: Search, person: Person) -> Candidates:
+    return search.candidates(search.objective(person).forgiving(), _LOOKED_AT)
+
+
+@eqx.filter_jit
+def _regularise(setup: Setup, person: Person, candidates: Candidates) -> FitResult:
+    objective, regulariser = setup.search.objective(person), setup.regulariser
     alone = jax.tree.map(lambda leaf: leaf[None], objective)
-    weights = setup.regulariser.weights.astype(candidates.vectors.dtype)
+    weights = regulariser.weights.astype(candidates.vectors.dtype)
 
     def energy(vector):
         now = unpacked(alone, vector[None])
         start = jax.tree.map(lambda leaf: leaf[None], objective.start)
-        return setup.regulariser.energy(setup.body, start, now)
+        return regulariser.energy(setup.body, start, now)
 
     looked = candidates.vectors
-    costs = jax.vmap(objective.cost)(looked)
+    # What was searched with a more forgiving loss costs something else with its own.
+    costs = candidates.costs if objective.robust is None else jax.vmap(objective.cost)(looked)
     energies = jax.vmap(energy)(looked)
     # The best by the keypoints, and the best that is free: what a graze costs to end is only known
     # when both have gone through the stages.
@@ -230,43 +194,16 @@ def _fit_one(setup: Setup, person: Person) -> FitResult:
     tracks = jnp.stack([looked[_least(costs)], looked[_least(judged)]])
 
     def through_stages(vector):
-        return descend(
-            setup.regulariser, setup.body, alone, vector[None], setup.solver, setup.max_steps
-        )
+        return descend(regulariser, setup.body, alone, vector[None], setup.solver, setup.max_steps)
 
     ends = jax.vmap(through_stages)(tracks)
-    totals = ends.cost + weights[-1] * ends.energy
-    best = _least(totals)
+    best = _least(ends.cost + weights[-1] * ends.energy)
     end = jax.tree.map(lambda leaf: leaf[best], ends)
-    return _result(setup, objective, end, candidates.steps + jnp.sum(ends.steps))
+    name = regulariser.name
+    cost = {} if name == "none" else {name: weights[-1] * end.energy}
+    steps = candidates.steps + jnp.sum(ends.steps)
+    return fit_result(setup.body, objective, end.vectors[0], cost, end.converged, steps)
 
 
 def _least(costs: Float[Array, "N"]) -> Int[Array, ""]:
     return jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))
-
-
-def _result(setup: Setup, objective: Objective, end: Descent, steps) -> FitResult:
-    vector = end.vectors[0]
-    found = objective.unpack(vector)
-    posed = setup.body(found.pose, found.shape, found.translation)
-    terms = objective.costs(vector)
-    del terms["ridge"]
-    name = setup.regulariser.name
-    if name != "none":
-        terms[name] = setup.regulariser.weights[-1].astype(vector.dtype) * end.energy
-    terms["total"] = sum(terms.values(), jnp.zeros((), vector.dtype))
-    finite = jnp.all(jnp.isfinite(posed.vertices)) & jnp.isfinite(terms["total"])
-    status = jnp.where(end.converged, 0, 1)
-    status = jnp.where(finite, status, 2)
-    status = jnp.where(jnp.any(objective.confidence > 0), status, 3)
-    return FitResult(
-        pose=found.pose,
-        shape=found.shape,
-        translation=found.translation,
-        vertices=posed.vertices,
-        joints=posed.joints,
-        keypoints=objective.project(vector),
-        steps=steps,
-        terms=terms,
-        status=status,
-    )

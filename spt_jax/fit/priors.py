@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -70,10 +71,15 @@ class GaussianPosePrior(eqx.Module):
 
     def of_joints(self, joints: Sequence[int]) -> "GaussianPosePrior":
         """The Gaussian of some joints, the root first, whatever the others do."""
-        inverse = jnp.linalg.inv(self.whitening)
         rows = np.array([3 * (k - 1) + axis for k in joints if k for axis in range(3)], np.int32)
-        covariance = (inverse @ inverse.T)[np.ix_(rows, rows)]
-        return GaussianPosePrior(self.mean[np.array(joints)], _whitening(covariance))
+        return GaussianPosePrior(*_marginal(self, np.array(joints), rows))
+
+
+@jax.jit
+def _marginal(prior: GaussianPosePrior, joints, rows):
+    inverse = jnp.linalg.inv(prior.whitening)
+    covariance = (inverse @ inverse.T)[rows[:, None], rows[None, :]]
+    return prior.mean[joints], _whitening(covariance)
 
 
 def _whitening(covariance: Float[Array, "D D"]) -> Float[Array, "D D"]:

@@ -18,6 +18,7 @@ from spt_jax.fit.objective import Objective, Weights
 from spt_jax.fit.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
 from spt_jax.fit.regularisers import Regulariser, as_regulariser
 from spt_jax.fit.solver import default_solver
+from spt_jax.fit.viewer import Viewer
 from spt_jax.keypoints import keypoint_regressor
 
 # Of the fit to the keypoints alone, for each start. With 60 all starts of eight frames were cut
@@ -25,31 +26,28 @@ from spt_jax.keypoints import keypoint_regressor
 _KEYPOINT_STEPS = 120
 
 
-class Setup(eqx.Module):
-    """The model, the camera, the terms and the solvers of a fit."""
+class Search(eqx.Module):
+    """What a fit to the keypoints alone has to know: camera, terms and solver."""
 
-    body: BodyModel
     figure: Figure
     camera: PinholeCamera
     prior: GaussianPosePrior | None
     limits: JointLimits | None
     weights: Weights
-    regulariser: Regulariser
     keypoint_solver: optx.AbstractMinimiser
-    solver: optx.AbstractMinimiser
     limbs: tuple[Limb, ...] = eqx.field(static=True)
     starts: int = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
     fit_shape: bool = eqx.field(static=True)
     fit_translation: bool = eqx.field(static=True)
 
     def objective(self, person: Person) -> Objective:
         """The squares of one person's fit."""
-        dtype = person.keypoints.dtype
-        up = self.camera.rotation.astype(dtype).T @ jnp.array([0.0, -1.0, 0.0], dtype)
+        dtype, viewer, start = person.keypoints.dtype, Viewer.of(self.camera), person.start
+        if self.starts:
+            start = start._replace(pose=start.pose.at[0].set(viewer.upright.astype(dtype)))
         return Objective(
             figure=self.figure,
-            camera=self.camera,
+            viewer=viewer,
             keypoints=person.keypoints,
             confidence=person.confidence,
             pixels=person.pixels,
@@ -57,8 +55,7 @@ class Setup(eqx.Module):
             prior=self.prior,
             limits=self.limits,
             weights=Weights(*(weight.astype(dtype) for weight in self.weights)),
-            up=up,
-            start=person.start,
+            start=start,
             fit_shape=self.fit_shape,
             fit_translation=self.fit_translation,
         )
@@ -70,6 +67,16 @@ class Setup(eqx.Module):
         return find_candidates(
             objective, self.limbs, self.starts, self.keypoint_solver, _KEYPOINT_STEPS, count
         )
+
+
+class Setup(eqx.Module):
+    """What a whole fit has to know: the search, and the stages that come after it."""
+
+    search: Search
+    body: BodyModel
+    regulariser: Regulariser
+    solver: optx.AbstractMinimiser
+    max_steps: int = eqx.field(static=True)
 
 
 def prepare_fit(
@@ -147,21 +154,24 @@ def prepare_fit(
     # Of the body alone, and read on the host: under jit its constants would be tracers there.
     with jax.ensure_compile_time_eval():
         figure = make_figure(body, keypoint_regressor(body, joints, count=count_points(keypoints)))
-    setup = Setup(
-        body=body,
+    search = Search(
         figure=figure,
         camera=camera,
         prior=likely and likely.of_joints(figure.moving),
         limits=ranges and ranges.of_joints(figure.moving),
         weights=Weights(*(jnp.asarray(float(weight)) for weight in weights.values())),
-        regulariser=as_regulariser(regulariser).prepared(body, in_scene),
         keypoint_solver=keypoint_solver or default_solver(),
-        solver=solver or default_solver(),
         limbs=limbs_of(figure.body),
         starts=int(starts) if pose is None else 0,
-        max_steps=int(max_steps),
         fit_shape=bool(fit_shape),
         fit_translation=bool(fit_translation),
+    )
+    setup = Setup(
+        search=search,
+        body=body,
+        regulariser=as_regulariser(regulariser).prepared(body, in_scene),
+        solver=solver or default_solver(),
+        max_steps=int(max_steps),
     )
     # A search starts from the middle of what is likely: a T-pose is far from any that people take.
     middle = (likely or pose_prior(body.joint_names)).mean

@@ -42,7 +42,7 @@ def orientation_starts(objective: Objective, count: int) -> Float[Array, "count 
         objective: of one person; what it holds fixed is kept.
         count: how many.
     """
-    camera = objective.camera
+    camera = objective.viewer.camera
     dtype = objective.keypoints.dtype
     base = objective.start
     rest = base.pose[objective.figure.rows].at[0].set(0.0)
@@ -75,9 +75,9 @@ def orientation_starts(objective: Objective, count: int) -> Float[Array, "count 
 
     distance = jnp.clip(1 / scale[chosen], _NEAREST, _FARTHEST)
     at = jnp.concatenate([image_centre, jnp.ones(1, dtype)])[None] * distance[:, None]
-    root = camera.rotation.astype(dtype).T @ turned[chosen]
-    world = (at - camera.translation.astype(dtype)[None]) @ camera.rotation.astype(dtype)
-    moved = world - jnp.einsum("sij,j->si", root, centre - joints[0]) - joints[:1]
+    over = camera.rotation.astype(dtype).T
+    root = over @ turned[chosen]
+    moved = at @ over.T - jnp.einsum("sij,j->si", root, centre - joints[0]) - joints[:1]
 
     def packed(root, moved):
         pose = rest.at[0].set(axis_angle_from_matrix(root))
