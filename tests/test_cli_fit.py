@@ -1,7 +1,9 @@
 """`spt-jax fit`: files in, files out, and what is said of bad ones."""
 
 import json
+from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +15,9 @@ from spt_jax.body.pose_files import read_poses
 from spt_jax.cli import main
 from spt_jax.commands import fitted
 from spt_jax.commands.annotated import read_camera, select_people
+from spt_jax.commands.fitting import scenes_of
+from spt_jax.fit import pose as fitting
+from spt_jax.fit.people import Penetration, PeopleResult
 from spt_jax.fit.result import FitResult
 from spt_jax.keypoints import LAYOUTS
 from spt_jax.show.overlay import read_image
@@ -186,6 +191,58 @@ def test_the_report_as_json_and_no_robust_loss(calls, tmp_path, rng, monkeypatch
     assert calls[0]["regulariser"].name == report["settings"]["regulariser"] == "none"
     assert [one["name"] for one in report["people"]] == [f"000000000001/{k}" for k in range(3)]
     assert "Pictures were left out: no time" in captured.err
+
+
+def test_people_of_an_image_together(calls, tmp_path, rng, monkeypatch, capsys):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    before = Penetration(*(jnp.asarray(x) for x in (2e-6, 1e-6, 9, 4)))
+    scenes = []
+
+    def together(body, keypoints, camera, **options):
+        scenes.append((len(keypoints), options))
+        rows = [
+            fitting.fit_pose(body, row, camera, **options | {"confidence": trust})
+            for row, trust in zip(keypoints, options["confidence"], strict=True)
+        ]
+        people = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
+        after = jax.tree.map(jnp.zeros_like, before)
+        return PeopleResult(people=people, before=before, after=after, steps=jnp.array(3))
+
+    monkeypatch.setattr("spt_jax.fit.people.fit_people", together)
+    # Two images, the people of the first on both sides of the other's.
+    people = [(1, person(rng)), (2, person(rng, missing=9)), (1, person(rng, missing=2))]
+    file = coco_file(tmp_path / "a.json", people, dict.fromkeys((1, 2), (640, 480)))
+    out = tmp_path / "out"
+    assert main(["fit", file, "--out", str(out), "--together"]) == 0
+    ((count, options),) = scenes
+    assert count == 2
+    sides = [np.ptp(rows[rows[:, 2] > 0, :2], axis=0).max() for k, rows in people if k == 1]
+    np.testing.assert_allclose(options["robust"], 0.1 * np.array(sides), rtol=1e-6)
+    report = json.loads((out / "report.json").read_text())
+    names = ["000000000001/0", "000000000001/2", "000000000002/1"]
+    assert [one["name"] for one in report["people"]] == names
+    for one, k in zip(report["people"], (0, 2, 1), strict=True):
+        assert one["terms"]["total"] == (people[k][1][:, 2] > 0).sum()
+    (scene,) = report["scenes"]
+    assert scene["image"] == "000000000001" and scene["people"] == names[:2]
+    assert scene["before"] == {
+        "volume_between": pytest.approx(2e-6),
+        "volume_within": pytest.approx(1e-6),
+        "crossings_between": 9,
+        "crossings_within": 4,
+    }
+    assert set(scene["after"].values()) == {0}
+    assert "2 people together" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_scene_has_one_layout():
+    def of(layout):
+        person = SimpleNamespace(layout=layout)
+        return SimpleNamespace(image="a", person=person)
+
+    with pytest.raises(ValueError, match=r"share a layout: got \['body25', 'coco17'\] in a"):
+        scenes_of([of("coco17"), of("body25")])
 
 
 class Overlap:

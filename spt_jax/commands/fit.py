@@ -30,6 +30,7 @@ def fit(
     regulariser: Literal["spt", "none", "spheres", "laplacian"] = "spt",
     robust: float | Literal["auto", "off"] = "auto",
     fit_shape: bool = False,
+    together: bool = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -59,6 +60,8 @@ def fit(
             "auto" is 10 % of the larger side of the box around the person's keypoints; "off" trusts
             them all.
         fit_shape: fit the body's shape too.
+        together: fit the people of an image as one scene, so that they do not pass through each
+            other either.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
@@ -88,13 +91,15 @@ def fit(
         from spt_jax.commands.fitted import (
             as_report,
             draw,
-            fit_everyone,
             people_table,
+            scene_lines,
             summary,
             write_bodies,
         )
+        from spt_jax.commands.fitting import fit_everyone, scenes_of
 
         with user_errors():
+            groups = scenes_of(chosen) if together else [[one] for one in chosen]
             model = load_body(body)
             for layout in {one.person.layout for one in chosen}:
                 keypoint_regressor(model, layout)
@@ -106,8 +111,8 @@ def fit(
             )
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
-        done = fit_everyone(
-            model, chosen, regulariser=regulariser, robust=robust, fit_shape=fit_shape, state=state
+        done, scenes = fit_everyone(
+            model, groups, regulariser=regulariser, robust=robust, fit_shape=fit_shape, state=state
         )
         with user_errors():
             state("writing", done=len(chosen))
@@ -122,8 +127,9 @@ def fit(
                 "regulariser": regulariser,
                 "robust": robust,
                 "fit_shape": fit_shape,
+                "together": together,
             }
-            report = as_report(done, settings)
+            report = as_report(done, scenes, settings)
             report["seconds"] = round(time.perf_counter() - start, 3)
             report["notes"] = notes
             report["meshes"] = meshes
@@ -137,6 +143,8 @@ def fit(
         console = out_console(quiet)
         console.print(people_table(done))
         show(console, summary(done))
+        for line in scene_lines(scenes):
+            show(console, line)
         drawn = f", {', '.join(pictures[:3])}{', ...' if len(pictures) > 3 else ''}"
         show(
             console,

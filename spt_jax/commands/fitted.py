@@ -1,18 +1,15 @@
-"""What `spt-jax fit` does with people once they are gathered: fit, tell, write, draw."""
+"""What `spt-jax fit` tells, writes and draws of people once they are fitted."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from spt_jax.commands.annotated import Annotated
 from spt_jax.commands.frames import _versions
-from spt_jax.commands.terminal import State
 from spt_jax.report import IntersectionReport
 
 if TYPE_CHECKING:
@@ -20,17 +17,6 @@ if TYPE_CHECKING:
 
     from spt_jax.body import BodyModel
     from spt_jax.fit.result import FitResult
-
-Named = Literal["spt", "none", "spheres", "laplacian"]
-
-# Detectors make mistakes, and a square counts one of them for more than all the rest. Mean joint
-# error of 24 motion-capture frames with 5 pixels of noise (2 % of the person), when none, one or
-# two of the 17 keypoints are off by 20 to 50 % of the person: 70, 200, 279 mm with plain squares;
-# 73, 102, 98 mm with this scale; 74, 141, 181 mm with twice as much. Half of it, 72, 74, 86 mm,
-# takes good points of unusual poses for mistakes: in 11 of 48 people who were seen in part, where
-# this scale did in 2.
-_ROBUST_SHARE = 0.1
-_LEAST_SCALE = 5.0  # pixels, of somebody of whom a point or two are seen
 
 _LARGEST_CANVAS = 2000  # pixels of a side, where there is no photograph
 _CUBIC_CENTIMETRES = 1e6
@@ -72,56 +58,6 @@ class Fitted:
         return off[person.confidence > 0]
 
 
-def fit_everyone(
-    body: "BodyModel",
-    people: Sequence[Annotated],
-    *,
-    regulariser: Named,
-    robust: "float | Literal['auto', 'off']",
-    fit_shape: bool,
-    state: State,
-) -> list[Fitted]:
-    """Fit everyone in turn, and measure the bodies' overlaps.
-
-    One by one, so that each may have a camera and the bar moves on; it compiles once a layout.
-    """
-    from spt_jax.fit import pose as fitting
-    from spt_jax.fit.regularisers import as_regulariser
-
-    prepared = as_regulariser(regulariser).prepared(body, 1)
-    found, compiled = [], set()
-    for k, one in enumerate(people):
-        person = one.person
-        new = person.layout not in compiled
-        compiled.add(person.layout)
-        state(f"{one.name}: {'compiling (10 to 40 s), then ' if new else ''}fitting", done=k)
-        start = time.perf_counter()
-        result = fitting.fit_pose(
-            body,
-            person.points.astype(np.float32),
-            one.camera,
-            joints=person.layout,
-            confidence=person.confidence.astype(np.float32),
-            regulariser=prepared,
-            robust=_robust_scale(one, robust),
-            fit_shape=fit_shape,
-        )
-        result = jax.tree.map(np.asarray, result)
-        seconds = time.perf_counter() - start
-        state(f"{one.name}: measuring")
-        found.append(_as_fitted(body, one, result, seconds))
-    return found
-
-
-def _robust_scale(one: Annotated, robust: "float | Literal['auto', 'off']") -> float | None:
-    if robust == "off":
-        return None
-    if robust != "auto":
-        return robust
-    seen = one.person.points[one.person.confidence > 0]
-    return max(_ROBUST_SHARE * float(np.ptp(seen, axis=0).max()), _LEAST_SCALE)
-
-
 def _scaled(camera: Any, scale: float) -> Any:
     from spt_jax.camera import PinholeCamera
 
@@ -129,7 +65,8 @@ def _scaled(camera: Any, scale: float) -> Any:
     return PinholeCamera(*(np.asarray(part, np.float32) for part in parts), near=camera.near)
 
 
-def _as_fitted(body: "BodyModel", one: Annotated, result: "FitResult", seconds: float) -> Fitted:
+def as_fitted(body: "BodyModel", one: Annotated, result: "FitResult", seconds: float) -> Fitted:
+    """One person's fit in NumPy, measured."""
     from spt_jax.report import intersection_report
 
     vertices = np.asarray(result.vertices)
@@ -205,7 +142,20 @@ def summary(people: Sequence[Fitted]) -> str:
     )
 
 
-def as_report(people: Sequence[Fitted], settings: dict[str, Any]) -> dict[str, Any]:
+def scene_lines(scenes: Sequence[dict[str, Any]]) -> list[str]:
+    """What became of people in each other, a line a scene."""
+    return [
+        f"{scene['image']}: {len(scene['people'])} people together, between them "
+        f"{scene['before']['volume_between'] * _CUBIC_CENTIMETRES:.2f} -> "
+        f"{scene['after']['volume_between'] * _CUBIC_CENTIMETRES:.2f} cm³, "
+        f"{scene['before']['crossings_between']} -> {scene['after']['crossings_between']} crossings"
+        for scene in scenes
+    ]
+
+
+def as_report(
+    people: Sequence[Fitted], scenes: Sequence[dict[str, Any]], settings: dict[str, Any]
+) -> dict[str, Any]:
     """What report.json holds."""
     return {
         "command": "fit",
@@ -213,6 +163,7 @@ def as_report(people: Sequence[Fitted], settings: dict[str, Any]) -> dict[str, A
         "settings": settings,
         "units": {"length": "m", "image": "px", "volume": "m^3", "time": "s", "angle": "rad"},
         "people": [_person_report(one) for one in people],
+        "scenes": list(scenes),
     }
 
 

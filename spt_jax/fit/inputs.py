@@ -32,8 +32,8 @@ def as_people(
     keypoints: Any,
     confidence: Any,
     start: tuple[Any, Any, Any],
-    expected_error: float | None,
-    robust: float | None,
+    expected_error: Any,
+    robust: Any,
 ) -> tuple[Person, tuple[int, ...]]:
     """All people of a call, in one leading axis, and the batch axes that they came with.
 
@@ -42,8 +42,8 @@ def as_people(
         keypoints: (..., K, 2), or a list of (K, 2).
         confidence: (..., K), a list of (K,), or None.
         start: pose; shape and translation as the user gave them, or None.
-        expected_error: in pixels, or None for a share of the person's size.
-        robust: Geman-McClure's scale in pixels, or None.
+        expected_error: in pixels, one or one a person, or None for a share of the person's size.
+        robust: Geman-McClure's scale in pixels, one or one a person, or None.
 
     Raises:
         TypeError, ValueError: as `fit_pose`.
@@ -71,8 +71,11 @@ def as_people(
     # What is not seen may hold anything; it must not reach a product, not even with zero.
     points = jnp.where(trust[..., None] > 0, points, 0.0).reshape(-1, count, 2)
     trust = trust.reshape(-1, count)
-    pixels = _expected_pixels(points, trust, expected_error)
-    scale = None if robust is None else as_positive("robust", robust) / pixels
+    if expected_error is None:
+        pixels = _share_of_size(points, trust)
+    else:
+        pixels = _one_each("expected_error", expected_error, batch, points.dtype)
+    scale = None if robust is None else _one_each("robust", robust, batch, points.dtype) / pixels
     people = Person(points, trust, pixels, scale, _starts(body, start, batch, points.dtype))
     return people, batch
 
@@ -127,15 +130,8 @@ def _check_values(points, trust) -> None:
         )
 
 
-def _expected_pixels(points, trust, expected_error) -> Float[Array, "people"]:
-    if expected_error is not None:
-        pixels = as_positive("expected_error", expected_error)
-        return jnp.full(points.shape[0], pixels, points.dtype)
-    return _share_of_size(points, trust)
-
-
 @jax.jit
-def _share_of_size(points, trust):
+def _share_of_size(points, trust) -> Float[Array, "people"]:
     seen = trust[..., None] > 0
     low = jnp.min(jnp.where(seen, points, jnp.inf), axis=1)
     high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=1)
@@ -179,17 +175,17 @@ def _broadcast(name: str, array, shape: tuple[int, ...]):
         ) from None
 
 
-def as_positive(name: str, value: Any) -> float:
-    """A number above zero.
-
-    Raises:
-        TypeError, ValueError: anything else.
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} must be a number: got {value!r}.")
-    if not 0 < value < np.inf:
+def _one_each(name: str, value: Any, batch: tuple[int, ...], dtype) -> Float[Array, "people"]:
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        array = None
+    real = (jnp.floating, jnp.integer)
+    if array is None or not any(jnp.issubdtype(array.dtype, kind) for kind in real):
+        raise TypeError(f"{name} must be a number, or one for each person: got {value!r}.")
+    if not isinstance(array, Tracer) and not ((array > 0) & (array < np.inf)).all():
         raise ValueError(f"{name} must be positive and finite: got {value!r}.")
-    return float(value)
+    return _broadcast(name, array.astype(dtype), batch).reshape(-1)
 
 
 def count_points(keypoints: Any) -> int:

@@ -42,8 +42,8 @@ def fit_pose(
     limits_weight: float = 1.0,
     shape_weight: float = 1.0,
     upright_weight: float = 0.25,
-    expected_error: float | None = None,
-    robust: float | None = None,
+    expected_error: Any = None,
+    robust: Any = None,
     starts: int = 6,
     solver: optx.AbstractMinimiser | None = None,
     keypoint_solver: optx.AbstractMinimiser | None = None,
@@ -91,10 +91,11 @@ def fit_pose(
         limits: "anatomical", the ranges in `spt_jax.fit.priors`; `joint_limits` of your own; or
             None.
         prior_weight, limits_weight, shape_weight, upright_weight: what each term counts for.
-        expected_error: of a keypoint, in pixels; by None a hundredth of the larger side of the box
-            around a person's keypoints.
-        robust: Geman-McClure's scale in pixels (rho(x) = x^2 / (1 + (x / scale)^2)): keypoints
-            much farther off are taken for mistakes. By None rho(x) = x^2.
+        expected_error: of a keypoint, in pixels, one number or one for each person, (...); by None
+            a hundredth of the larger side of the box around a person's keypoints.
+        robust: Geman-McClure's scale in pixels (rho(x) = x^2 / (1 + (x / scale)^2)), one number or
+            one for each person, (...): keypoints much farther off are taken for mistakes. By None
+            rho(x) = x^2.
         starts: how many orientations to try.
         solver: of the regularised stages, any optimistix minimiser; BFGS by default.
         keypoint_solver: of the keypoints' objective, likewise.

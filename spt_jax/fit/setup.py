@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
+from jaxtyping import Array
 
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
@@ -98,8 +100,8 @@ def prepare_fit(
     limits_weight: float,
     shape_weight: float,
     upright_weight: float,
-    expected_error: float | None,
-    robust: float | None,
+    expected_error: Any,
+    robust: Any,
     starts: int,
     solver: Any,
     keypoint_solver: Any,
@@ -134,10 +136,10 @@ def prepare_fit(
         "shape_weight": shape_weight,
         "upright_weight": upright_weight,
     }
-    for name, weight in weights.items():
-        numeric = isinstance(weight, (int, float, np.integer, np.floating))
-        if not numeric or not 0 <= weight < np.inf:
-            raise ValueError(f"{name} must be a finite number, not negative: got {weight!r}.")
+    weights = {name: _as_weight(name, weight) for name, weight in weights.items()}
+    for name, flag in (("fit_shape", fit_shape), ("fit_translation", fit_translation)):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise TypeError(f"{name} must be True or False: got {flag!r}.")
     likely, ranges = _as_prior(body, prior), _as_limits(body, limits)
     for name, rows in (("prior", likely and likely.mean), ("limits", ranges and ranges.low)):
         if rows is not None and len(rows) != body.num_joints:
@@ -159,7 +161,7 @@ def prepare_fit(
         camera=camera,
         prior=likely and likely.of_joints(figure.moving),
         limits=ranges and ranges.of_joints(figure.moving),
-        weights=Weights(*(jnp.asarray(float(weight)) for weight in weights.values())),
+        weights=Weights(**{name.removesuffix("_weight"): w for name, w in weights.items()}),
         keypoint_solver=keypoint_solver or default_solver(),
         limbs=limbs_of(figure.body),
         starts=int(starts) if pose is None else 0,
@@ -178,6 +180,17 @@ def prepare_fit(
     start = (middle if pose is None else pose, shape, translation)
     people, batch = as_people(body, keypoints, confidence, start, expected_error, robust)
     return setup, people, batch
+
+
+def _as_weight(name: str, weight: Any) -> Array:
+    # A JAX scalar may change without compiling anew, and may be traced.
+    number = isinstance(weight, (int, float, np.integer, np.floating))
+    known = number or (isinstance(weight, Array) and not isinstance(weight, Tracer))
+    if not isinstance(weight, Tracer) and not (
+        known and np.ndim(weight) == 0 and 0 <= float(weight) < np.inf
+    ):
+        raise ValueError(f"{name} must be a finite number, not negative: got {weight!r}.")
+    return jnp.asarray(weight, jnp.zeros(()).dtype)
 
 
 def _as_prior(body: BodyModel, prior: Any) -> GaussianPosePrior | None:
