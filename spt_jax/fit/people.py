@@ -161,9 +161,11 @@ def _descend_together(
         )
     )(objectives, fits.pose, fits.shape, fits.translation)
     end = descend(setup.regulariser, setup.body, objectives, vectors, setup.solver, setup.max_steps)
-    found = jax.vmap(lambda *one: fit_result(setup.body, *one[:2], {}, end.converged, one[2]))(
-        objectives, end.vectors, fits.steps
-    )
+
+    def each(objective, vector, steps):
+        return fit_result(setup.body, objective, vector, {}, end.converged, steps)
+
+    found = jax.vmap(each)(objectives, end.vectors, fits.steps)
     return found, end.steps
 
 

@@ -25,6 +25,22 @@ from spt_jax.rest_surface import RestSurface
 _CENTIMETRE = 0.01
 
 
+def as_weights(weights: Any) -> Float[Array, "stages"]:
+    """Weights of the stages as an array.
+
+    Raises:
+        ValueError: none at all, or negative or not finite ones.
+    """
+    if isinstance(weights, Tracer):  # as when a regulariser is prepared inside jit
+        return jnp.atleast_1d(weights)
+    rows = np.atleast_1d(np.asarray(weights, np.float64))
+    if rows.ndim != 1 or not rows.size or not np.isfinite(rows).all() or rows.min() < 0:
+        raise ValueError(
+            f"weights must be finite and not negative, one for each stage: got {weights!r}."
+        )
+    return jnp.asarray(rows)
+
+
 class Regulariser(eqx.Module):
     """A term that `fit_pose` adds to the keypoints' in stages, its weight rising.
 
@@ -59,9 +75,7 @@ class Nothing(Regulariser):
     """No term: the keypoints, the prior and the limits alone ("RE only")."""
 
     name: ClassVar[str] = "none"
-    weights: Float[Array, "stages"] = eqx.field(
-        converter=lambda given: as_weights(given), default=(0.0,)
-    )
+    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(0.0,))
 
     def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
         """Zero."""
@@ -85,9 +99,7 @@ class SelfIntersection(Regulariser):
     """
 
     name: ClassVar[str] = "spt"
-    weights: Float[Array, "stages"] = eqx.field(
-        converter=lambda given: as_weights(given), default=(0.01, 0.1, 1.0)
-    )
+    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(0.01, 0.1, 1.0))
     _: dataclasses.KW_ONLY
     folds: Literal["ignore", "count"] = eqx.field(static=True, default="ignore")
     margin: float | Float[Array, ""] = eqx.field(
@@ -138,9 +150,7 @@ class Spheres(Regulariser):
     """
 
     name: ClassVar[str] = "spheres"
-    weights: Float[Array, "stages"] = eqx.field(
-        converter=lambda given: as_weights(given), default=(0.1, 1.0)
-    )
+    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(0.1, 1.0))
     spheres: BodySpheres | None = None
 
     def prepared(self, body: BodyModel, people: int) -> "Spheres":
@@ -170,9 +180,7 @@ class Laplacian(Regulariser):
     """
 
     name: ClassVar[str] = "laplacian"
-    weights: Float[Array, "stages"] = eqx.field(
-        converter=lambda given: as_weights(given), default=(1.0,)
-    )
+    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(1.0,))
     laplacian: MeshLaplacian | None = None
 
     def prepared(self, body: BodyModel, people: int) -> "Laplacian":
@@ -214,19 +222,3 @@ def as_regulariser(regulariser: Any) -> Regulariser:
     listed = ", ".join(repr(name) for name in NAMED)
     kind = ValueError if isinstance(regulariser, str) else TypeError
     raise kind(f"regulariser must be one of {listed}, or a Regulariser: got {regulariser!r}.")
-
-
-def as_weights(weights: Any) -> Float[Array, "stages"]:
-    """Weights of the stages as an array.
-
-    Raises:
-        ValueError: none at all, or negative or not finite ones.
-    """
-    if isinstance(weights, Tracer):  # as when a regulariser is prepared inside jit
-        return jnp.atleast_1d(weights)
-    rows = np.atleast_1d(np.asarray(weights, np.float64))
-    if rows.ndim != 1 or not rows.size or not np.isfinite(rows).all() or rows.min() < 0:
-        raise ValueError(
-            f"weights must be finite and not negative, one for each stage: got {weights!r}."
-        )
-    return jnp.asarray(rows)
