@@ -97,12 +97,13 @@ class Fitter:
             return Spheres(weights)
         if self.method == "RE + SPT":
             return SelfIntersection(weights)
-        # Section 4.3: Eqs. 10 and 11, one direction, folds and all, gradient descent.
+        # Section 4.3: Eqs. 10 and 11, Algorithm 1, one direction, folds and all, gradient descent.
         return SelfIntersection(
             weights,
             folds="count",
             value="ratio",
             gradient="unit",
+            rule="triangle",
             rays=512,
             directions=1,
         )

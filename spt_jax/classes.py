@@ -15,6 +15,7 @@ from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
 from spt_jax.overlap.measure import Rule, Sampling, measure, usable
+from spt_jax.overlap.triangles.pairs import Entangled
 from spt_jax.overlap.triangles.sheets import Map
 from spt_jax.rest_surface import RestSurface
 
@@ -92,8 +93,8 @@ def classify_vertices(
             whole or not at all.
 
     Returns:
-        The classes; all V_0 where a vertex is not finite, and V_0 where every ray through the
-        vertex meets a hole.
+        The classes; all V_0 where the penalty is NaN, and V_0 where every ray through the vertex
+        meets a hole.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`.
@@ -116,7 +117,8 @@ def classify_vertices(
     vertices, faces = as_mesh(vertices, faces)
     sampling = Sampling(as_rays(rays), as_directions(directions))
     exclusions = as_exclusions(face_groups, ignore_groups, folds, given)
-    options = _Options(as_choice("rule", rule, Rule), sampling, exclusions)
+    rounding = float(jnp.finfo(vertices.dtype).eps)
+    options = _Options(as_choice("rule", rule, Rule), sampling, exclusions, rounding)
     return VertexClasses(_labels(options, vertices, faces))
 
 
@@ -124,6 +126,7 @@ class _Options(NamedTuple):
     rule: Rule
     sampling: Sampling
     exclusions: Exclusions
+    rounding: float  # machine epsilon of the vertices
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -134,7 +137,10 @@ def _labels(options, vertices, faces):
 
 
 def _labels_on_host(vertices, faces, options: _Options, map_tasks: Map):
-    if not usable(vertices, faces) or faces.size == 0:
+    if not usable(vertices, faces, options.rounding) or faces.size == 0:
         return (np.zeros(len(vertices), np.int8),)
     found = measure(vertices, faces, options.sampling, options.exclusions, map_tasks)
-    return (found.labels(options.rule),)
+    try:
+        return (found.labels(options.rule),)
+    except Entangled:
+        return (np.zeros(len(vertices), np.int8),)

@@ -21,6 +21,7 @@ from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Gradient, Rule, Sampling, Value, measure, usable
+from spt_jax.overlap.triangles.pairs import Entangled
 from spt_jax.overlap.triangles.sheets import Map
 from spt_jax.rest_surface import RestSurface
 
@@ -85,8 +86,10 @@ def self_intersection_penalty(
         backend: "auto" or "numpy".
 
     Returns:
-        One number per mesh, in the vertices' dtype. NaN, with a zero gradient, where a vertex is
-        not finite or a traced face is out of range.
+        One number per mesh, in the vertices' dtype. NaN, with a zero gradient, where there is no
+        surface to measure: a vertex is not finite, a traced face is out of range, the mesh is
+        smaller than 1024 units in the last place of its coordinates, or so crumpled that more than
+        20 pairs of triangles to a triangle (and 2,000,000) are near each other.
 
     Raises:
         TypeError: vertices not float32 or float64; faces or groups not whole numbers; rays,
@@ -125,6 +128,7 @@ def self_intersection_penalty(
         as_choice("rule", rule, Rule),
         Sampling(as_rays(rays), as_directions(directions)),
         as_exclusions(face_groups, ignore_groups, folds, given),
+        float(jnp.finfo(vertices.dtype).eps),
     )
     if apart:
         vertices = inflate(vertices, faces, apart / 2)
@@ -183,6 +187,7 @@ class _Options(NamedTuple):
     rule: Rule
     sampling: Sampling
     exclusions: Exclusions
+    rounding: float  # machine epsilon of the vertices
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -223,17 +228,20 @@ def _value_and_gradient_on_host(vertices, faces, options: _Options, map_tasks: M
 
 def _measure(vertices, faces, options: _Options, map_tasks: Map, *, with_gradient: bool):
     gradient = np.zeros_like(vertices)
-    if not usable(vertices, faces):
+    if not usable(vertices, faces, options.rounding):
         return np.array(np.nan), gradient
     if faces.size == 0:
         return np.zeros(()), gradient
     found = measure(vertices, faces, options.sampling, options.exclusions, map_tasks)
-    if options.value == "volume":
-        value = np.array(found.volume)
-    else:
-        value = np.mean(found.labels(options.rule) != 0)
-    if with_gradient:
-        gradient = found.gradient(options.gradient, options.rule)
+    try:
+        if options.value == "volume":
+            value = np.array(found.volume)
+        else:
+            value = np.mean(found.labels(options.rule) != 0)
+        if with_gradient:
+            gradient = found.gradient(options.gradient, options.rule)
+    except Entangled:
+        return np.array(np.nan), gradient
     if not (np.isfinite(value) and np.isfinite(gradient).all()):  # coordinates near overflow
         return np.array(np.nan), np.zeros_like(vertices)
     return value, gradient

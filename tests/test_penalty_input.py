@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box
+import trimesh
+from helpers import box, embedded_body
 from helpers_penalty import FACES, PAIR, as_jax, loss
 
 from spt_jax import RestSurface, classify_vertices, intersection_report, self_intersection_penalty
+from spt_jax.overlap.triangles import pairs
 
 OPTIONS = {
     "default": {},
@@ -164,3 +166,35 @@ def test_directions_scale_and_type_do_not_matter():
     assert one == self_intersection_penalty(GOOD, FACES, rays=32, directions=[[0, 0, -1e-200]])
     three = self_intersection_penalty(GOOD, FACES, rays=32, directions=jnp.eye(3))
     assert three == pytest.approx(float(one), rel=0.05)
+
+
+@pytest.mark.parametrize("rays", ["auto", 32])
+def test_a_mesh_that_rounding_has_eaten_is_nan_and_a_point_is_free(dtype, rays):
+    """What a solver that was thrown off course hands over; it took all memory once."""
+    body = embedded_body()
+    home = np.asarray(body.template, dtype)
+    away = np.array([[3e5 if dtype == np.float32 else 3e14, 0.0, 0.0]], dtype)
+
+    def both(vertices):
+        def loss(v):
+            return self_intersection_penalty(v, body.faces, rays=rays)
+
+        value, gradient = jax.value_and_grad(loss)(jnp.asarray(vertices, dtype))
+        assert np.abs(gradient).max() == 0
+        return value
+
+    assert np.isnan(both(home + away))
+    assert both(np.zeros_like(home) + away) == 0
+
+
+def test_a_crumpled_mesh_is_nan_and_the_report_says_why(monkeypatch, rng):
+    monkeypatch.setattr(pairs, "_MOST_PAIRS", 1000)
+    monkeypatch.setattr(pairs, "_MOST_PAIRS_EACH", 0)
+    faces = trimesh.creation.icosphere(3).faces
+    vertices = rng.normal(size=(faces.max() + 1, 3))
+    crumpled = jnp.asarray(vertices, jnp.float32)
+    value, gradient = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces))(crumpled)
+    assert np.isnan(value) and not np.asarray(gradient).any()
+    assert not np.asarray(classify_vertices(crumpled, faces).label).any()
+    with pytest.raises(ValueError, match=r"vertices must be a surface .* more than 1,000 pairs of"):
+        intersection_report(vertices, faces)

@@ -92,9 +92,10 @@ class SelfIntersection(Regulariser):
         folds: "ignore" leaves out the creases of skin at joints, "count" counts them as overlap.
         margin: how far apart parts are pushed, in metres; 0 measures the surface as it is. As a
             JAX array it may change without compiling anew.
-        value, gradient: as in `self_intersection_penalty`. "ratio" with "unit" is the paper's term
-            (Eqs. 10 and 11), which has no line search: use it with `optimistix.GradientDescent`.
-            The ratio is in per cent then, and no gradient of the value.
+        value, gradient, rule: as in `self_intersection_penalty`. "ratio" with "unit" and "triangle"
+            is the paper's term (Eqs. 10 and 11, Algorithm 1), which has no line search: use it with
+            `optimistix.GradientDescent`. The ratio is in per cent then, and no gradient of the
+            value.
         rays, directions: as in `self_intersection_penalty`.
     """
 
@@ -107,6 +108,7 @@ class SelfIntersection(Regulariser):
     )
     value: Literal["volume", "ratio"] = eqx.field(static=True, default="volume")
     gradient: Literal["boundary", "vertex", "unit"] = eqx.field(static=True, default="boundary")
+    rule: Literal["vertex", "triangle"] = eqx.field(static=True, default="vertex")
     rays: Any = eqx.field(static=True, default="auto", converter=as_rays)
     directions: Any = eqx.field(static=True, default=3, converter=as_directions)
     rest: RestSurface | None = eqx.field(static=True, default=None)
@@ -115,6 +117,7 @@ class SelfIntersection(Regulariser):
         as_choice("folds", self.folds, Literal["ignore", "count"])
         as_choice("value", self.value, Literal["volume", "ratio"])
         as_choice("gradient", self.gradient, Literal["boundary", "vertex", "unit"])
+        as_choice("rule", self.rule, Literal["vertex", "triangle"])
 
     def prepared(self, body: BodyModel, people: int) -> "SelfIntersection":
         """With the rest surface that folds are told by."""
@@ -135,6 +138,7 @@ class SelfIntersection(Regulariser):
             scene.faces,
             value=self.value,
             gradient=self.gradient,
+            rule=self.rule,
             rays=self.rays,
             directions=np.array(self.directions),
             folds=self.rest,

@@ -31,6 +31,11 @@ Gradient = Literal["boundary", "vertex", "unit"]
 Rule = Literal["vertex", "triangle"]
 
 
+# Of a mesh, in units in the last place of its largest coordinate. In float32 a body that stands 14
+# km from the origin is this small: its triangles are as large as the rounding.
+_LEAST_EXTENT = 1024
+
+
 class Sampling(NamedTuple):
     """How a mesh is sampled: the directions of the beams and the rays of each."""
 
@@ -227,9 +232,23 @@ def measure(
     return Measurement(vertices, faces, sampling, exclusions, map_tasks)
 
 
-def usable(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> bool:
-    """Whether the mesh can be measured: every coordinate finite, every index in range."""
-    return bool(
-        np.isfinite(vertices).all()
-        and (faces.size == 0 or (faces.min() >= 0 and faces.max() < len(vertices)))
-    )
+def usable(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], rounding: float
+) -> bool:
+    """Whether the mesh can be measured.
+
+    Every coordinate finite, every index in range, and not so far from the origin that rounding has
+    eaten the shape.
+
+    Args:
+        vertices: positions.
+        faces: indices.
+        rounding: machine epsilon of the numbers that the vertices came in.
+    """
+    if not np.isfinite(vertices).all():
+        return False
+    if faces.size == 0:
+        return True
+    extent = np.ptp(vertices, axis=0).max()
+    far = 0 < extent < _LEAST_EXTENT * rounding * np.abs(vertices).max()
+    return bool(not far and faces.min() >= 0 and faces.max() < len(vertices))
