@@ -1,4 +1,4 @@
-"""The command line: spt-jax demo, check, untangle and fit."""
+"""The command line: spt-jax demo, check, untangle, fit and view."""
 
 import os
 import sys
@@ -12,8 +12,9 @@ from spt_jax.commands.demo import demo
 from spt_jax.commands.fit import fit
 from spt_jax.commands.terminal import CommandError
 from spt_jax.commands.untangle import untangle
+from spt_jax.commands.view import view
 
-_COMMANDS = {"demo": demo, "check": check, "untangle": untangle, "fit": fit}
+_COMMANDS = {"demo": demo, "check": check, "untangle": untangle, "fit": fit, "view": view}
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -1,0 +1,135 @@
+"""Files that the live view reads, whatever they hold, and what it hands out."""
+
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from spt_jax.body import BodyModel, load_body, load_mocap
+from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
+from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.mesh_check import check_mesh
+from spt_jax.mesh_files import read_mesh, write_mesh
+from spt_jax.view.scene import Reading, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Poses in a body's own joints, to be looked through."""
+
+    names: list[str]
+    pose: Float[np.ndarray, "N J 3"]
+    shape: Float[np.ndarray, "N B"] | None = None
+    translation: Float[np.ndarray, "N 3"] | None = None
+
+    def load_into(self, scene: Scene, row: int) -> None:
+        """Show one frame."""
+        shape = None if self.shape is None else self.shape[row]
+        translation = None if self.translation is None else self.translation[row]
+        scene.load(self.pose[row], shape, translation)
+
+
+def open_file(path: Path) -> Scene | PoseFile:
+    """What a file holds: a mesh or a body as a scene, or poses.
+
+    Args:
+        path: .pkl is an SMPL model; .npz one too if it has `v_template`, otherwise poses; anything
+            else is a mesh, which must be closed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file cannot be read, or the mesh is not closed and consistently wound.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"file must exist: got {str(path)!r}; check the spelling")
+    if path.suffix == ".pkl" or _is_model(path):
+        return Scene.of_body(load_body(path), path.stem)
+    if path.suffix.lower() == ".npz":
+        return read_poses(path)
+    vertices, faces = read_mesh(path)
+    check_mesh(vertices, faces).raise_if_unfit()
+    return Scene.of_mesh(vertices, faces, path.stem)
+
+
+def open_upload(name: str, content: bytes) -> Scene | PoseFile:
+    """The same for a file that a browser sent; nothing of it stays on the disk.
+
+    Raises:
+        ValueError: as `open_file`; the message says the file's name, not where it lay meanwhile.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / (Path(name.replace("\\", "/")).name or "file")
+        path.write_bytes(content)
+        try:
+            return open_file(path)
+        except (OSError, TypeError, ValueError) as error:
+            raise ValueError(str(error).replace(str(path), path.name)) from error
+
+
+def frames_for(given: PoseFile, body: BodyModel, *, embedded: bool) -> tuple[Frames, list[str]]:
+    """The file's poses on a body, and what of them had to be left out."""
+    notes = []
+    shape = given.shape
+    if shape is not None and embedded:
+        notes.append("The file's shape is left out: it is in SMPL's components.")
+        shape = None
+    elif shape is not None and shape.shape[-1] > body.num_shape:
+        notes.append(f"Shape components after the body's {body.num_shape} are left out.")
+        shape = shape[..., : body.num_shape]
+    if shape is not None:
+        shape = np.broadcast_to(shape, (len(given.pose), shape.shape[-1]))
+    layout = SMPL_LAYOUTS[given.pose.shape[1]]
+    turned = np.any(given.pose, axis=(0, 2))
+    lost = [name for name, used in zip(layout, turned, strict=True) if used]
+    lost = [name for name in lost if name not in body.joint_names]
+    if lost:
+        shown = ", ".join(lost[:4]) + (", ..." if len(lost) > 4 else "")
+        notes.append(f"The body lacks {shown}: their rotations are left out.")
+    pose = np.asarray(body.pose_from_smpl(given.pose.astype(np.float32)))
+    return Frames(list(given.names), pose, shape, given.translation), notes
+
+
+def mocap_for(body: BodyModel) -> dict[str, Frames]:
+    """The motions that come with the package, on a body."""
+    mocap = load_mocap()
+    poses = np.asarray(body.pose_from_smpl(mocap.pose))
+    motions = np.array([name.split("/")[0] for name in mocap.names])
+    return {
+        motion: Frames(
+            [name for name in mocap.names if name.split("/")[0] == motion],
+            poses[motions == motion],
+        )
+        for motion in dict.fromkeys(motions.tolist())
+    }
+
+
+def mesh_bytes(scene: Scene, reading: Reading) -> bytes:
+    """The surface as a .glb, coloured by class."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.glb"
+        write_mesh(path, reading.vertices, scene.faces, reading.labels)
+        return path.read_bytes()
+
+
+def pose_bytes(scene: Scene) -> bytes:
+    """The pose as an .npz in AMASS' layout, with shape and translation.
+
+    Raises:
+        ValueError: a mesh has no pose.
+    """
+    if scene.body is None:
+        raise ValueError("pose must come from a body: got a mesh; save it as .glb.")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pose.npz"
+        write_poses(path, scene.pose, shape=scene.shape, translation=scene.translation)
+        return path.read_bytes()
+
+
+def _is_model(path: Path) -> bool:
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "v_template.npy" in archive.namelist()

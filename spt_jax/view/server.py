@@ -1,0 +1,239 @@
+"""The live view: viser's server, its panel and stage, and the worker that serves them."""
+
+import contextlib
+import sys
+import threading
+import traceback
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+from spt_jax.body import load_body
+from spt_jax.body.pose_files import PoseFile
+from spt_jax.view import files
+from spt_jax.view.freeing import untangle_scene
+from spt_jax.view.panel import MEASURES, Panel
+from spt_jax.view.scene import Reading, Scene
+from spt_jax.view.stage import Stage
+from spt_jax.view.worker import Worker
+
+# A fist in the belly: something to set free at first sight.
+_FIRST = ("punch", "punch/0013")
+_ERROR_SECONDS = 15.0
+
+
+class View:
+    """A scene in the browser.
+
+    Methods whose names do not start with an underscore, `start`, `stop_serving` and `url` aside,
+    are what the panel asks for; they run on the worker's thread.
+
+    Args:
+        file: poses, a mesh or an SMPL model to begin with; the embedded body if None.
+        host: address to serve on; anybody who can reach it can use the view.
+        port: the next free one is taken where it is in use.
+
+    Raises:
+        ImportError: viser is not installed.
+        OSError, ValueError: the file cannot be read; nothing is served then.
+    """
+
+    def __init__(self, file: Path | None = None, *, host: str = "127.0.0.1", port: int = 8080):
+        viser = import_viser()
+        opened = None if file is None else files.open_file(file)
+        with contextlib.redirect_stdout(None):  # its banner; the command says where it serves
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self._stop = threading.Event()
+        self._stage = Stage(self.server)
+        self._status = "ready"
+        self._motions: dict[str, files.Frames] = {}
+        self._embedded = True
+        self.worker = Worker(self._refresh, self._report)
+        self._take(opened if opened is not None else _embedded_body(), file, first=True)
+
+    @property
+    def url(self) -> str:
+        """Where the view is served."""
+        host = self.server.get_host()
+        return f"http://{'localhost' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+
+    def start(self) -> None:
+        """Begin to work."""
+        self.worker.post("start", lambda: None)
+        self.worker.start()
+
+    def stop_serving(self, timeout: float = 5.0) -> bool:
+        """End the server; whether the work under way ended too."""
+        self._stop.set()
+        ended = self.worker.stop(timeout)
+        self.server.stop()
+        return ended
+
+    # What the panel asks for.
+
+    def choose_motion(self, motion: str) -> None:
+        """Show the first frame of another motion."""
+        self.panel.choose_motion(motion)
+        self.choose_frame(0)
+
+    def choose_frame(self, row: int) -> None:
+        """Show a frame of the motion."""
+        frames = self._motions[self.panel.motion.value]
+        row = min(int(row), len(frames.names) - 1)
+        frames.load_into(self.scene, row)
+        self._status = frames.names[row]
+
+    def choose_part(self, part: str) -> None:
+        """Put the handles on another part of the body."""
+        self.panel.choose_part(part)
+        self._stage.set_handles(self.scene, self.panel.joints, self._turned)
+
+    def choose_joint(self, _: str) -> None:
+        """The sliders follow by themselves."""
+
+    def turn_axis(self, joint: int, axis: int, degrees: float) -> None:
+        """Turn a joint by a slider."""
+        self.scene.turn(joint, axis, degrees)
+
+    def turn_in_world(self, joint: int, wxyz: tuple[float, ...]) -> None:
+        """Turn a joint by its handle."""
+        self.panel.choose_joint(joint)
+        self.scene.turn_in_world(joint, wxyz)
+
+    def set_shape(self, component: int, value: float) -> None:
+        """Set a shape coefficient."""
+        self.scene.set_shape(component, value)
+
+    def count_folds(self, wanted: bool) -> None:
+        """Whether folds count."""
+        self.scene.count_folds = wanted
+
+    def measure_by(self, way: str) -> None:
+        """Measure the volume, or as the paper does."""
+        self.scene.paper = way == MEASURES[1]
+
+    def see_through(self, wanted: bool) -> None:
+        """Whether hidden overlaps are seen."""
+        self._stage.set_see_through(wanted)
+
+    def reset(self) -> None:
+        """Back to what was loaded."""
+        self.scene.reset()
+        self._status = "ready"
+
+    def untangle(self) -> None:
+        """Set the scene free, every step shown."""
+        self._stop.clear()
+        self.panel.show_busy(True)
+        self._show(self.scene.read(), "untangling; the first time takes some seconds to compile")
+        before = self.scene.read()
+        try:
+            untangle_scene(
+                self.scene,
+                lambda vertices, text: self._show(self.scene.read(vertices), f"untangling: {text}"),
+                self._stop.is_set,
+            )
+        finally:
+            self.panel.show_busy(False)
+        self._status = "stopped" if self._stop.is_set() else _outcome(before, self.scene.read())
+
+    def open_upload(self, name: str, content: bytes) -> None:
+        """Show a file that a browser sent; a bad one changes nothing."""
+        self._take(files.open_upload(name, content), Path(name), first=False)
+
+    def save_mesh(self, client: Any) -> None:
+        """Hand the surface to the browser that asked."""
+        content = files.mesh_bytes(self.scene, self.scene.read())
+        client.send_file_download("spt_jax.glb", content, save_immediately=True)
+
+    def save_pose(self, client: Any) -> None:
+        """Hand the pose to the browser that asked."""
+        content = files.pose_bytes(self.scene)
+        client.send_file_download("spt_jax_pose.npz", content, save_immediately=True)
+
+    # How.
+
+    def _do(self, key: Hashable, action: str, *arguments: Any, **keywords: Any) -> None:
+        if action == "stop":  # not after what it is to stop
+            self._stop.set()
+            return
+        self.worker.post(key, lambda: getattr(self, action)(*arguments, **keywords))
+
+    def _turned(self, joint: int, wxyz: tuple[float, ...]) -> None:
+        self._do(("handle", joint), "turn_in_world", joint, wxyz)
+
+    def _take(self, opened: Scene | PoseFile, file: Path | None, *, first: bool) -> None:
+        notes: list[str] = []
+        if isinstance(opened, PoseFile):
+            scene = self.scene if not first else _embedded_body()
+            if scene.body is None:
+                scene, self._embedded = _embedded_body(), True
+            name = Path(file or "poses").name
+            frames, notes = files.frames_for(opened, scene.body, embedded=self._embedded)  # type: ignore
+            motions, start = {name: frames, **files.mocap_for(scene.body)}, (name, 0)  # type: ignore
+        else:
+            scene = opened
+            self._embedded = file is None
+            motions = {} if scene.body is None else files.mocap_for(scene.body)
+            start = (_FIRST[0], motions[_FIRST[0]].names.index(_FIRST[1])) if motions else None
+        if start is not None:
+            motions[start[0]].load_into(scene, start[1])
+        reading = scene.read()  # distances along the surface at rest take two seconds, once
+        self.scene, self._motions = scene, motions
+        self._status = "ready" if start is None else motions[start[0]].names[start[1]]
+        self._stage.begin(scene, reading)
+        self.panel = Panel(self.server, scene, motions, start, self._do)
+        self._stage.set_handles(scene, self.panel.joints, self._turned)
+        for note in notes:
+            self._notify("Note", note)
+
+    def _refresh(self, keys: set[Hashable]) -> None:
+        self._show(self.scene.read(), self._status)
+        dragged = [key[1] for key in keys if isinstance(key, tuple) and key[0] == "handle"]
+        self._stage.place_handles(self.scene, but=dragged)
+        # A slider must not be set under the hand that moves it.
+        if not all(isinstance(key, tuple) and key[0] in ("slider", "shape") for key in keys):
+            self.panel.show_state()
+
+    def _show(self, reading: Reading, status: str) -> None:
+        self._stage.show(reading, self.scene.faces)
+        self.panel.show_figures(reading, status)
+
+    def _report(self, error: Exception) -> None:
+        message = " ".join(str(error).split())
+        if not isinstance(error, OSError | TypeError | ValueError):
+            traceback.print_exception(error, file=sys.stderr)
+            message = f"{type(error).__name__}: {message}"
+        self._status = message
+        self._notify("That did not work", message, color="red")
+
+    def _notify(self, title: str, body: str, color: str | None = None) -> None:
+        for client in self.server.get_clients().values():
+            client.add_notification(title, body, auto_close_seconds=_ERROR_SECONDS, color=color)
+
+
+def import_viser() -> Any:
+    """Return viser.
+
+    Raises:
+        ImportError: it is not installed; the message names the extra.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError(
+            f'the live view needs viser: got "{error}"; run: pip install "spt_jax[view]"'
+        ) from error
+    return viser
+
+
+def _embedded_body() -> Scene:
+    return Scene.of_body(load_body(), "the embedded body")
+
+
+def _outcome(before: Reading, after: Reading) -> str:
+    if not before.crossing_pairs and not before.volume:
+        return "nothing to untangle"
+    if not after.crossing_pairs:
+        return "free"
+    return f"not free: {after.crossing_pairs} pairs of triangles still cross"

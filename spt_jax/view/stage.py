@@ -1,0 +1,162 @@
+"""The 3D side of the live view: the surface in the colours of its classes, and the handles."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
+from spt_jax.overlap.labels import OUT
+from spt_jax.show.framing import frame, marked_triangles
+from spt_jax.view.scene import Reading, Scene
+
+# The background of the pictures that `spt_jax.show` draws.
+_BACKGROUND = (246, 244, 240)
+_OPACITY = 0.7
+# Of the body's height; fingers stand closer together than other joints.
+_HANDLE, _SMALL_HANDLE = 0.1, 0.022
+_FLOOR_COLOUR, _LINE_COLOUR = (238, 235, 229), (226, 221, 213)
+# A narrow view, from as far as it takes: limbs near the camera look no larger than they are.
+_FIELD_OF_VIEW = 0.5  # radians, of the height
+
+_CLEAR, _OUT, _IN = "/surface/clear", "/surface/out", "/surface/in"
+# Drawn first, in no colour at all, it hides all but the surface's front layer: transparent
+# triangles are not sorted, and those behind would show through in patches.
+_VEIL = "/surface/veil"
+
+Turned = Callable[[int, tuple[float, ...]], None]
+
+
+class Stage:
+    """The surface and its handles on a viser server."""
+
+    def __init__(self, server: Any):
+        self._server = server
+        self._meshes: dict[str, Any] = {}
+        self._handles: dict[int, Any] = {}
+        self.see_through = True
+
+    def begin(self, scene: Scene, reading: Reading) -> None:
+        """Clear the stage for another scene, and look at it."""
+        api = self._server.scene
+        api.reset()
+        api.set_up_direction("+y")
+        api.set_background_image(np.full((1, 1, 3), _BACKGROUND, np.uint8))
+        self._meshes, self._handles = {}, {}
+        self._look_at(reading, scene.faces)
+
+    def _look_at(self, reading: Reading, faces: Int[np.ndarray, "F 3"]) -> None:
+        # From where the pictures of `spt_jax.show` would look: most of the overlap is seen.
+        points = reading.vertices.astype(np.float64)
+        towards = frame([points], faces, [reading.labels], "auto", 1.0).axes[2]
+        low, high = points.min(axis=0), points.max(axis=0)
+        middle, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+        cell = 10.0 ** np.floor(np.log10(size)) / 4
+        self._server.scene.add_grid(
+            "/floor",
+            width=3 * size,
+            height=3 * size,
+            plane="xz",
+            cell_color=_FLOOR_COLOUR,
+            section_color=_LINE_COLOUR,
+            cell_size=cell,
+            section_size=4 * cell,
+            position=(middle[0], low[1], middle[2]),
+        )
+        position = middle + towards * 0.6 * size / np.tan(_FIELD_OF_VIEW / 2)
+        cameras = [client.camera for client in self._server.get_clients().values()]
+        for camera in (self._server.initial_camera, *cameras):
+            camera.fov = _FIELD_OF_VIEW
+            camera.position, camera.look_at = position, middle
+
+    def show(self, reading: Reading, faces: Int[np.ndarray, "F 3"]) -> None:
+        """Draw the surface that was measured."""
+        marked = marked_triangles(reading.labels, faces)
+        out = marked & (reading.labels[faces] == OUT).any(axis=1)
+        with self._server.atomic():
+            self._draw(_VEIL, reading.vertices, faces, ~marked, BODY_COLOUR)
+            self._draw(_CLEAR, reading.vertices, faces, ~marked, BODY_COLOUR)
+            self._draw(_OUT, reading.vertices, faces, out, OUT_COLOUR)
+            self._draw(_IN, reading.vertices, faces, marked & ~out, IN_COLOUR)
+            self.set_see_through(self.see_through)
+
+    def set_see_through(self, wanted: bool) -> None:
+        """Whether what is in another part shines through it."""
+        self.see_through = wanted
+        if self._meshes:
+            # Without overlap there is nothing to see, and an opaque surface is crisper.
+            veiled = wanted and any(self._meshes[name].visible for name in (_OUT, _IN))
+            self._meshes[_VEIL].visible = veiled and self._meshes[_CLEAR].visible
+            self._meshes[_CLEAR].opacity = _OPACITY if veiled else None
+
+    def set_handles(self, scene: Scene, joints: Sequence[int], turned: Turned) -> None:
+        """Rings to turn these joints by, in place of those that were there."""
+        for handle in self._handles.values():
+            handle.remove()
+        self._handles = {}
+        height = float(np.ptp(scene.vertices, axis=0).max()) or 1.0
+        for joint in joints:
+            handle = self._server.scene.add_transform_controls(
+                f"/handles/{joint}",
+                scale=height * (_SMALL_HANDLE if len(joints) > 8 else _HANDLE),
+                line_width=2.0,
+                disable_axes=True,
+                disable_sliders=True,
+                depth_test=False,
+                opacity=0.85,
+            )
+            handle.on_update(_listener(joint, turned))
+            self._handles[joint] = handle
+        self.place_handles(scene)
+
+    def place_handles(self, scene: Scene, but: Sequence[int] = ()) -> None:
+        """Move the handles to their joints, except those that are being dragged."""
+        if not self._handles:
+            return
+        joints, orientations = scene.joints, scene.orientations()
+        for joint, handle in self._handles.items():
+            handle.position = joints[joint]
+            if joint not in but:
+                handle.wxyz = orientations[joint]
+
+    def _draw(
+        self,
+        name: str,
+        vertices: Float[np.ndarray, "V 3"],
+        faces: Int[np.ndarray, "F 3"],
+        chosen: Bool[np.ndarray, "F"],
+        colour: tuple[int, int, int],
+    ) -> None:
+        # Only what the triangles use is sent: a few hundred vertices for a spot.
+        used, triangles = np.unique(faces[chosen], return_inverse=True)
+        points, triangles = vertices[used], triangles.reshape(-1, 3)
+        if not len(triangles):
+            if name in self._meshes:
+                self._meshes[name].visible = False
+            points, triangles = vertices[:3], np.zeros((1, 3), np.int64)
+        known = self._meshes.get(name)
+        if known is None:
+            self._meshes[name] = self._server.scene.add_mesh_simple(
+                name,
+                points,
+                triangles,
+                color=colour,
+                opacity=0.0 if name == _VEIL else None,
+                visible=bool(chosen.any()),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        elif chosen.any():
+            known.vertices = points.astype(np.float32)
+            known.faces = triangles.astype(np.uint32)
+            known.visible = True
+
+
+def _listener(joint: int, turned: Turned) -> Any:
+    # async: viser keeps the order of such events, and posting does not wait.
+    async def on_update(event: Any) -> None:
+        if event.client is not None and event.phase != "start":
+            turned(joint, tuple(event.target.wxyz))
+
+    return on_update
