@@ -24,7 +24,13 @@ import tyro
 from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.pose_scenes import JOINTS, Scene, camera, prior_without, stored_scenes
 from spt_jax import classify_vertices, fit_pose, load_body
-from spt_jax.fit.regularisers import Laplacian, Nothing, Regulariser, SelfIntersection, Spheres
+from spt_jax.fit.terms.regularisers import (
+    Laplacian,
+    Nothing,
+    Regulariser,
+    SelfIntersection,
+    Spheres,
+)
 
 TABLE_SCENES = 139  # as many as the paper's reduced test set of UP-3D
 RISE = (0.01, 0.1, 1.0)  # of each method's weight, stage by stage
@@ -33,8 +39,8 @@ PAPER_RATE = 0.3  # gradient descent in coordinates in which the keypoints' cost
 # The last weight of each method, keypoints alone and with prior and limits: see --tune.
 WEIGHTS = {
     "RE": (0.0, 0.0),
-    "RE + LR": (100.0, 0.1),
-    "RE + SA": (3.0, 3.0),
+    "RE + LR": (10.0, 0.1),
+    "RE + SA": (10.0, 3.0),
     "RE + SPT": (1.0, 0.1),
     "RE + SPT, paper": (1e-3, 1e-3),
 }

@@ -11,7 +11,7 @@ from spt_jax import PinholeCamera, keypoint_regressor
 from spt_jax.body import BodyModel
 from spt_jax.fit.figure import Variables, make_figure
 from spt_jax.fit.objective import Objective, Weights
-from spt_jax.fit.priors import joint_limits, pose_prior
+from spt_jax.fit.terms.priors import joint_limits, pose_prior
 from spt_jax.fit.viewer import Viewer
 
 # World with y up, and a camera that looks along -z from 4 m away, a metre above the floor.

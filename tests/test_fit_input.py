@@ -10,7 +10,7 @@ from helpers_fit import camera, frames, seen
 
 from spt_jax import PinholeCamera, fit_pose
 from spt_jax.fit.inputs import as_people, count_points
-from spt_jax.fit.priors import joint_limits, pose_prior
+from spt_jax.fit.terms.priors import joint_limits, pose_prior
 
 POINTS = np.asarray(seen(frames("walk/0010"))[0])
 SPOILT = POINTS.copy()

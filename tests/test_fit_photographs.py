@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera, fit_pose, load_body, load_mocap, read_keypoints
-from spt_jax.fit.priors import joint_limits
+from spt_jax.fit.terms.priors import joint_limits
 from spt_jax.keypoints import LAYOUTS, keypoint_regressor
 
 WIDTH, HEIGHT = 640, 480

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera, fit_pose, intersection_report
 from spt_jax.fit.figure import Variables
-from spt_jax.fit.regularisers import Nothing, Regulariser, SelfIntersection, as_regulariser
 from spt_jax.fit.stages import descend
+from spt_jax.fit.terms.regularisers import Nothing, Regulariser, SelfIntersection, as_regulariser
 
 NAMES = (
     "walk/0010",

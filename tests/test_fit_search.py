@@ -13,11 +13,11 @@ from helpers_fit import UPRIGHT, camera, figure, frames, objective, seen
 from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera
-from spt_jax.fit.candidates import find_candidates, refine_start
 from spt_jax.fit.figure import Variables
-from spt_jax.fit.flips import combined_flips, limb_flips, limbs_of
+from spt_jax.fit.search.candidates import find_candidates, refine_start
+from spt_jax.fit.search.flips import combined_flips, limb_flips, limbs_of
+from spt_jax.fit.search.starts import orientation_starts
 from spt_jax.fit.solver import SettledBFGS, default_solver
-from spt_jax.fit.starts import orientation_starts
 
 
 def turned(pose, *turns):

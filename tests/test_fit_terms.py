@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from spt_jax import keypoint_regressor, self_intersection_penalty
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.fit.figure import Variables, make_figure
-from spt_jax.fit.priors import GaussianPosePrior, joint_limits, pose_prior
-from spt_jax.fit.regularisers import (
+from spt_jax.fit.terms.priors import GaussianPosePrior, joint_limits, pose_prior
+from spt_jax.fit.terms.regularisers import (
     Laplacian,
     Nothing,
     Regulariser,

@@ -8,7 +8,7 @@ import pytest
 from helpers import box, random_rotation
 from helpers import sphere as solid_sphere
 
-from spt_jax.fit.laplacian import MeshLaplacian, laplacian_penalty
+from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
 
 VERTICES, FACES = solid_sphere(subdivisions=1)
 COUNT = len(VERTICES)

@@ -67,7 +67,7 @@ def fit_everyone(
     """
     from spt_jax.fit import people as scenes
     from spt_jax.fit import pose as fitting
-    from spt_jax.fit.regularisers import as_regulariser
+    from spt_jax.fit.terms.regularisers import as_regulariser
 
     prepared = as_regulariser(regulariser).prepared(body, 1)
     found, told, compiled = [], [], set()

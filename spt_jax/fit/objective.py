@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.fit.figure import Figure, Variables
-from spt_jax.fit.priors import GaussianPosePrior, JointLimits
+from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits
 from spt_jax.fit.viewer import Viewer
 
 # Per squared radian (and squared unit of shape) away from the start. It decides where nothing else

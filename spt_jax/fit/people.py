@@ -16,10 +16,10 @@ from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
 from spt_jax.fit.inputs import Person
 from spt_jax.fit.pose import fit_pose
-from spt_jax.fit.regularisers import SelfIntersection, as_weights
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import descend
+from spt_jax.fit.terms.regularisers import SelfIntersection, as_weights
 from spt_jax.groups import between_groups, join_bodies, within_groups
 from spt_jax.report import intersection_report
 

@@ -11,13 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
-from spt_jax.fit.candidates import Candidates
 from spt_jax.fit.inputs import Person
-from spt_jax.fit.priors import GaussianPosePrior, JointLimits
-from spt_jax.fit.regularisers import Regulariser
 from spt_jax.fit.result import FitResult, fit_result
+from spt_jax.fit.search.candidates import Candidates
 from spt_jax.fit.setup import Search, Setup, prepare_fit
 from spt_jax.fit.stages import descend, unpacked
+from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits
+from spt_jax.fit.terms.regularisers import Regulariser
 
 # Candidates whose energy is looked at before two of them go through the regularised stages.
 _LOOKED_AT = 4
@@ -88,8 +88,8 @@ def fit_pose(
         fit_translation: whether to fit the translation.
         prior: "mocap", a Gaussian of the embedded motion capture; one of your own (`pose_prior`);
             or None.
-        limits: "anatomical", the ranges in `spt_jax.fit.priors`; `joint_limits` of your own; or
-            None.
+        limits: "anatomical", the ranges in `spt_jax.fit.terms.priors`; `joint_limits` of your own;
+            or None.
         prior_weight, limits_weight, shape_weight, upright_weight: what each term counts for.
         expected_error: of a keypoint, in pixels, one number or one for each person, (...); by None
             a hundredth of the larger side of the box around a person's keypoints.

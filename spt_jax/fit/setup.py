@@ -12,14 +12,14 @@ from jaxtyping import Array
 
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
-from spt_jax.fit.candidates import Candidates, find_candidates, refine_start
 from spt_jax.fit.figure import Figure, make_figure
-from spt_jax.fit.flips import Limb, limbs_of
 from spt_jax.fit.inputs import Person, as_people, count_points
 from spt_jax.fit.objective import Objective, Weights
-from spt_jax.fit.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
-from spt_jax.fit.regularisers import Regulariser, as_regulariser
+from spt_jax.fit.search.candidates import Candidates, find_candidates, refine_start
+from spt_jax.fit.search.flips import Limb, limbs_of
 from spt_jax.fit.solver import default_solver
+from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
+from spt_jax.fit.terms.regularisers import Regulariser, as_regulariser
 from spt_jax.fit.viewer import Viewer
 from spt_jax.keypoints import keypoint_regressor
 

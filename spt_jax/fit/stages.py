@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax.body import BodyModel
 from spt_jax.fit.figure import Variables
 from spt_jax.fit.objective import Objective
-from spt_jax.fit.regularisers import Regulariser
+from spt_jax.fit.terms.regularisers import Regulariser
 
 
 class Descent(NamedTuple):

@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float, UInt8
 
 from spt_jax.body import BodyModel
-from spt_jax.fit.spheres import BodySpheres, sphere_depths
+from spt_jax.fit.terms.spheres import BodySpheres, sphere_depths
 from spt_jax.mesh_files import OUT_COLOUR
 from spt_jax.show.framing import View, frame
 from spt_jax.show.offscreen import import_extra

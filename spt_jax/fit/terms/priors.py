@@ -110,7 +110,7 @@ def pose_prior(
 
     Example:
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.priors import pose_prior
+        >>> from spt_jax.fit.terms.priors import pose_prior
         >>> prior = pose_prior(load_body().joint_names)
         >>> bool(prior(prior.mean) < prior(-prior.mean))
         True
@@ -206,7 +206,7 @@ def joint_limits(
 
     Example:
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.priors import joint_limits
+        >>> from spt_jax.fit.terms.priors import joint_limits
         >>> names = load_body().joint_names
         >>> print(joint_limits(names).high[names.index("left_knee")])
         [2.6 0.3 0.2]

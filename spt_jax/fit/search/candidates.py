@@ -8,9 +8,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from spt_jax.fit.flips import Limb, combined_flips, limb_flips, num_flips
 from spt_jax.fit.objective import Objective
-from spt_jax.fit.starts import orientation_starts
+from spt_jax.fit.search.flips import Limb, combined_flips, limb_flips, num_flips
+from spt_jax.fit.search.starts import orientation_starts
 
 # Two fits whose variables agree to this, in radians and metres, are the same fit found twice.
 _SAME = 0.15

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 from spt_jax.arguments import as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
 from spt_jax.fit.figure import Variables
-from spt_jax.fit.laplacian import MeshLaplacian, laplacian_penalty
-from spt_jax.fit.spheres import BodySpheres, sphere_penalty
+from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
+from spt_jax.fit.terms.spheres import BodySpheres, sphere_penalty
 from spt_jax.geometry import inflate
 from spt_jax.groups import join_bodies
 from spt_jax.penalty import self_intersection_penalty

@@ -23,7 +23,7 @@ class MeshLaplacian(eqx.Module):
 
     Example:
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.laplacian import MeshLaplacian, laplacian_penalty
+        >>> from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
         >>> body = load_body()
         >>> laplacian = MeshLaplacian.from_faces(body.faces, body.num_vertices)
         >>> rest = body.rest()
@@ -118,7 +118,7 @@ def laplacian_penalty(
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
-        >>> from spt_jax.fit.laplacian import MeshLaplacian, laplacian_penalty
+        >>> from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
         >>> square = jnp.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         >>> two = MeshLaplacian.from_faces(np.array([[0, 1, 2], [0, 2, 3]]), 4)
         >>> lifted = square.at[1, 2].set(3.0)  # deltas change by 3, -1, -1 and 0

@@ -1,0 +1,1 @@
+"""Where a fit starts, and the local minima that it looks through."""
