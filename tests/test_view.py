@@ -311,9 +311,13 @@ def test_the_command_refuses_a_bad_file_before_it_serves(capsys, tmp_path):
     assert cli.main(["view", str(tmp_path / "nothing.npz"), "--quiet"]) == 2
     seen = capsys.readouterr()
     assert "nothing.npz" in seen.err and not seen.out
+    assert cli.main(["view", "--host", "no.such.host.invalid", "--quiet"]) == 2
+    assert "host must be an address of this machine" in capsys.readouterr().err
 
 
-def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(ball_file):
+def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(
+    ball_file, pair_file, tmp_path
+):
     pytest.importorskip("viser", reason="the live view needs viser")
     from spt_jax.view.server import View
 
@@ -334,5 +338,14 @@ def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(ball
         view._do("handle", "turn_in_world", 4, (1.0, 0.0, 0.0, 0.0))
         assert view.worker.wait_until_idle(20)
         assert scene.paper and scene.count_folds and view.panel.joint == 4
+        view._do("open", "open_upload", "pair.ply", pair_file.read_bytes())
+        view._do("untangle", "untangle")
+        assert view.worker.wait_until_idle(30)
+        assert view.scene.body is None and view._status == "free"
+        write_poses(tmp_path / "two.npz", np.zeros((2, 22, 3)), names=["one", "two"])
+        view._do("open", "open_upload", "two.npz", (tmp_path / "two.npz").read_bytes())
+        view._do("frame", "choose_frame", 1)
+        assert view.worker.wait_until_idle(30)
+        assert view.scene.body.num_vertices == 12_272 and view._status == "two"
     finally:
         assert view.stop_serving()

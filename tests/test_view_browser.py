@@ -145,13 +145,7 @@ def _leave_picture(page):
     path = os.environ.get("SPT_JAX_VIEW_PICTURE")
     if not path:
         return
-    from PIL import Image
-
     for close in page.locator(".mantine-Notification-closeButton").all():  # of software WebGL
         close.click()
     page.wait_for_timeout(3000)
     page.screenshot(path=path)
-    # The panel and a grey body have few colours: a third of the bytes, and no loss to be seen.
-    Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )

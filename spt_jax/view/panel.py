@@ -1,6 +1,7 @@
 """The panel of the live view: figures, buttons and sliders. It only posts what users do."""
 
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -66,9 +67,9 @@ class Panel:
             return
         degrees = np.degrees(self._scene.pose[self.joint])
         for slider, value in zip(self.axes, degrees, strict=True):
-            slider.value = float(np.clip(value, slider.min, slider.max))
+            slider.value = _within(slider, float(value))
         for slider, value in zip(self.shape, self._scene.shape, strict=True):
-            slider.value = float(np.clip(value, slider.min, slider.max))
+            slider.value = _within(slider, float(value))
 
     def choose_part(self, part: str) -> None:
         """Offer the joints of another part."""
@@ -166,6 +167,9 @@ class Panel:
         with self._gui.add_folder("Files"):
             hint = "Poses (.npz), a mesh (.ply, .obj, .stl, .off, .glb), an SMPL model (.npz, .pkl)"
             upload = self._gui.add_upload_button("Open a file", hint=hint)
+            if self._scene.body is None:
+                embedded = self._gui.add_button("Embedded body", color="gray")
+                self._on(embedded, "open", "open_embedded", click=True, value=False)
             save_mesh = self._gui.add_button("Save GLB", color="gray")
             self._on(save_mesh, "save_mesh", "save_mesh", click=True, value=False, client=True)
             if self._scene.body is not None:
@@ -199,6 +203,11 @@ class Panel:
         widget.on_click(on_event) if click else widget.on_update(on_event)
 
 
+def _within(slider: Any, value: float) -> float:
+    # Rounded, and never -0.0, which would be shown.
+    return round(float(np.clip(value, slider.min, slider.max)), 2) + 0.0
+
+
 def figures(reading: Reading, scene: Scene, status: str) -> str:
     """What was measured, as HTML."""
     volume, ratio = volume_text(reading.volume, scene), f"{reading.ratio:.2%}"
@@ -218,11 +227,11 @@ def figures(reading: Reading, scene: Scene, status: str) -> str:
     return (
         '<div id="spt-figures" style="padding:0.2em 1em 0.4em 1em;font-size:0.8em;'
         f'font-variant-numeric:tabular-nums" data-volume="{reading.volume!r}" '
-        f'data-status="{_escaped(status)}">'
+        f'data-status="{escape(status)}">'
         f'<div style="font-size:2.3em;font-weight:650;line-height:1.25">{large}</div>'
-        f'<div style="opacity:0.7;margin-bottom:0.5em">{large_name} of {_escaped(scene.name)}</div>'
+        f'<div style="opacity:0.7;margin-bottom:0.5em">{large_name} of {escape(scene.name)}</div>'
         f'<table style="width:100%;border-spacing:0">{table}</table>'
-        f'<div style="opacity:0.7;margin-top:0.5em">{_escaped(status)}</div></div>'
+        f'<div style="opacity:0.7;margin-top:0.5em">{escape(status) or "&nbsp;"}</div></div>'
     )
 
 
@@ -236,9 +245,3 @@ def volume_text(volume: float, scene: Scene) -> str:
 def _dot(colour: tuple[int, int, int]) -> str:
     style = "display:inline-block;width:0.75em;height:0.75em;border-radius:50%"
     return f'<span style="{style};background:rgb{colour}"></span>'
-
-
-def _escaped(text: str) -> str:
-    from html import escape
-
-    return escape(text, quote=True)

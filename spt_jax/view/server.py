@@ -1,6 +1,7 @@
 """The live view: viser's server, its panel and stage, and the worker that serves them."""
 
 import contextlib
+import socket
 import sys
 import threading
 import traceback
@@ -35,11 +36,13 @@ class View:
 
     Raises:
         ImportError: viser is not installed.
-        OSError, ValueError: the file cannot be read; nothing is served then.
+        OSError, ValueError: the file cannot be read, or the host is no address of this machine;
+            nothing is served then.
     """
 
     def __init__(self, file: Path | None = None, *, host: str = "127.0.0.1", port: int = 8080):
         viser = import_viser()
+        _check_host(host)
         opened = None if file is None else files.open_file(file)
         with contextlib.redirect_stdout(None):  # its banner; the command says where it serves
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -55,7 +58,8 @@ class View:
     def url(self) -> str:
         """Where the view is served."""
         host = self.server.get_host()
-        return f"http://{'localhost' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+        name = {"0.0.0.0": "localhost"}.get(host, f"[{host}]" if ":" in host else host)
+        return f"http://{name}:{self.server.get_port()}"
 
     def start(self) -> None:
         """Begin to work."""
@@ -66,7 +70,8 @@ class View:
         """End the server; whether the work under way ended too."""
         self._stop.set()
         ended = self.worker.stop(timeout)
-        self.server.stop()
+        with contextlib.redirect_stdout(None):
+            self.server.stop()
         return ended
 
     # What the panel asks for.
@@ -94,23 +99,28 @@ class View:
     def turn_axis(self, joint: int, axis: int, degrees: float) -> None:
         """Turn a joint by a slider."""
         self.scene.turn(joint, axis, degrees)
+        self._status = ""
 
     def turn_in_world(self, joint: int, wxyz: tuple[float, ...]) -> None:
         """Turn a joint by its handle."""
         self.panel.choose_joint(joint)
         self.scene.turn_in_world(joint, wxyz)
+        self._status = ""
 
     def set_shape(self, component: int, value: float) -> None:
         """Set a shape coefficient."""
         self.scene.set_shape(component, value)
+        self._status = ""
 
     def count_folds(self, wanted: bool) -> None:
         """Whether folds count."""
         self.scene.count_folds = wanted
+        self._status = ""
 
     def measure_by(self, way: str) -> None:
         """Measure the volume, or as the paper does."""
         self.scene.paper = way == MEASURES[1]
+        self._status = ""
 
     def see_through(self, wanted: bool) -> None:
         """Whether hidden overlaps are seen."""
@@ -140,6 +150,10 @@ class View:
     def open_upload(self, name: str, content: bytes) -> None:
         """Show a file that a browser sent; a bad one changes nothing."""
         self._take(files.open_upload(name, content), Path(name), first=False)
+
+    def open_embedded(self) -> None:
+        """Show the body that comes with the package."""
+        self._take(_embedded_body(), None, first=False)
 
     def save_mesh(self, client: Any) -> None:
         """Hand the surface to the browser that asked."""
@@ -225,6 +239,18 @@ def import_viser() -> Any:
             f'the live view needs viser: got "{error}"; run: pip install "spt_jax[view]"'
         ) from error
     return viser
+
+
+def _check_host(host: str) -> None:
+    # viser 1.1 tries in a thread, and waits for ever where that fails.
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as trial:
+            trial.bind(address)
+    except OSError as error:
+        raise ValueError(
+            f"host must be an address of this machine, such as 127.0.0.1: got {host!r} ({error})."
+        ) from error
 
 
 def _embedded_body() -> Scene:
