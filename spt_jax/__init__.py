@@ -1,5 +1,8 @@
 """A self-intersection penalty for triangle meshes and body models in JAX."""
 
+import importlib
+import typing
+
 from spt_jax.body import BodyModel as BodyModel
 from spt_jax.body import PosedBody as PosedBody
 from spt_jax.body import load_body as load_body
@@ -7,17 +10,10 @@ from spt_jax.body import load_mocap as load_mocap
 from spt_jax.camera import PinholeCamera as PinholeCamera
 from spt_jax.classes import VertexClasses as VertexClasses
 from spt_jax.classes import classify_vertices as classify_vertices
-from spt_jax.fit.people import PeopleResult as PeopleResult
-from spt_jax.fit.people import fit_people as fit_people
-from spt_jax.fit.pose import fit_pose as fit_pose
-from spt_jax.fit.result import FitResult as FitResult
 from spt_jax.groups import Scene as Scene
 from spt_jax.groups import between_groups as between_groups
 from spt_jax.groups import join_bodies as join_bodies
 from spt_jax.groups import within_groups as within_groups
-from spt_jax.keypoints import KeypointRegressor as KeypointRegressor
-from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
-from spt_jax.keypoints import read_keypoints as read_keypoints
 from spt_jax.mesh_check import MeshCheck as MeshCheck
 from spt_jax.mesh_check import check_mesh as check_mesh
 from spt_jax.penalty import paper_penalty as paper_penalty
@@ -25,7 +21,43 @@ from spt_jax.penalty import self_intersection_penalty as self_intersection_penal
 from spt_jax.report import IntersectionReport as IntersectionReport
 from spt_jax.report import intersection_report as intersection_report
 from spt_jax.rest_surface import RestSurface as RestSurface
-from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
-from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
-from spt_jax.untangle.pose import UntangleResult as UntangleResult
-from spt_jax.untangle.pose import untangle_pose as untangle_pose
+
+if typing.TYPE_CHECKING:
+    from spt_jax.fit.people import PeopleResult as PeopleResult
+    from spt_jax.fit.people import fit_people as fit_people
+    from spt_jax.fit.pose import fit_pose as fit_pose
+    from spt_jax.fit.result import FitResult as FitResult
+    from spt_jax.keypoints import KeypointRegressor as KeypointRegressor
+    from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
+    from spt_jax.keypoints import read_keypoints as read_keypoints
+    from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
+    from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
+    from spt_jax.untangle.pose import UntangleResult as UntangleResult
+    from spt_jax.untangle.pose import untangle_pose as untangle_pose
+
+# Imported when they are first asked for: who only calls the penalty does not wait for optimistix.
+_LATER = {
+    "FitResult": "spt_jax.fit.result",
+    "KeypointRegressor": "spt_jax.keypoints",
+    "PeopleResult": "spt_jax.fit.people",
+    "UntangleMeshResult": "spt_jax.untangle.mesh",
+    "UntangleResult": "spt_jax.untangle.pose",
+    "fit_people": "spt_jax.fit.people",
+    "fit_pose": "spt_jax.fit.pose",
+    "keypoint_regressor": "spt_jax.keypoints",
+    "read_keypoints": "spt_jax.keypoints",
+    "untangle_mesh": "spt_jax.untangle.mesh",
+    "untangle_pose": "spt_jax.untangle.pose",
+}
+
+
+def __getattr__(name: str) -> typing.Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(importlib.import_module(_LATER[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LATER})

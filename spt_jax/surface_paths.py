@@ -5,9 +5,8 @@ import hashlib
 import threading
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 # Every piece of the mesh gets a seed.
 MOST_PIECES = 512
@@ -69,7 +68,7 @@ class SurfacePaths:
         edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         self._longest = edges.max(axis=1, initial=0.0).astype(np.float32)
         self._graph = _edge_graph(content.vertices, self.faces)
-        labels = connected_components(self._graph, directed=False)[1]
+        labels = scipy.sparse.csgraph.connected_components(self._graph, directed=False)[1]
         self.pieces = len(np.unique(labels[self.faces[:, 0]]))
         self._lock = threading.Lock()
         self._table: _Table | None = None
@@ -138,7 +137,7 @@ class SurfacePaths:
         ways = graph.nnz + 3 * np.arange(1, len(sources) + 1)
         vertices = len(self.content.vertices)
         size = vertices + len(sources)
-        with_sources = csr_array(
+        with_sources = scipy.sparse.csr_array(
             (
                 np.concatenate([graph.data, np.full(3 * len(sources), _NO_LENGTH)]),
                 np.concatenate([graph.indices, self.faces[sources].ravel()]),
@@ -146,7 +145,9 @@ class SurfacePaths:
             ),
             shape=(size, size),
         )
-        to_vertices = dijkstra(with_sources, indices=np.arange(vertices, size), limit=limit)
+        to_vertices = scipy.sparse.csgraph.dijkstra(
+            with_sources, indices=np.arange(vertices, size), limit=limit
+        )
         return _to_faces(np.ascontiguousarray(to_vertices.T), self.faces).T
 
     def _ready(self) -> "_Table":
@@ -167,7 +168,7 @@ class _Table:
         most = min(_SEEDS, len(used), max(_LARGEST_TABLE // max(len(faces), 1), pieces))
         rows, nearest = [], np.full(len(used), np.inf)
         while len(rows) < most and nearest.max() > 0:
-            rows.append(dijkstra(graph, indices=used[nearest.argmax()]))
+            rows.append(scipy.sparse.csgraph.dijkstra(graph, indices=used[nearest.argmax()]))
             nearest = np.minimum(nearest, rows[-1][used])
         to_vertices = np.array(rows, np.float32).reshape(len(rows), graph.shape[0]).T
         self.rows = _to_faces(np.ascontiguousarray(to_vertices), faces)
@@ -191,11 +192,13 @@ def _to_faces(to_vertices, faces):
     return best
 
 
-def _edge_graph(vertices, faces) -> csr_array:
+def _edge_graph(vertices, faces) -> "scipy.sparse.csr_array":
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ends = np.unique(np.sort(ends, axis=1), axis=0)
     length = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
     length = np.maximum(length, _NO_LENGTH)
     rows, columns = np.concatenate([ends, ends[:, ::-1]]).T
     shape = (len(vertices), len(vertices))
-    return csr_array(coo_array((np.tile(length, 2), (rows, columns)), shape=shape))
+    return scipy.sparse.csr_array(
+        scipy.sparse.coo_array((np.tile(length, 2), (rows, columns)), shape=shape)
+    )

@@ -1,6 +1,10 @@
 """The public names and signatures; a change here is a change for every user."""
 
 import inspect
+import subprocess
+import sys
+
+import pytest
 
 import spt_jax
 
@@ -39,9 +43,9 @@ PARAMETERS = {
     "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
     " rule='vertex', rays='auto', directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
     " folds=None, backend='auto'",
-    "paper_penalty": "vertices, faces, *, rays=512, normalize=True",
+    "paper_penalty": "vertices, faces, *, rays=512, normalize=True, backend='auto'",
     "classify_vertices": "vertices, faces, *, rays='auto', directions=3, rule='vertex',"
-    " face_groups=None, ignore_groups=(), folds=None",
+    " face_groups=None, ignore_groups=(), folds=None, backend='auto'",
     "intersection_report": "vertices, faces, *, rays='auto', directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), folds=None",
     "check_mesh": "vertices, faces",
@@ -78,10 +82,18 @@ def bare_signature(function) -> str:
 def test_names():
     public = [
         name
-        for name, value in vars(spt_jax).items()
-        if not name.startswith("_") and not inspect.ismodule(value)
+        for name in dir(spt_jax)
+        if not name.startswith("_") and not inspect.ismodule(getattr(spt_jax, name))
     ]
     assert sorted(public) == NAMES
+    with pytest.raises(AttributeError, match="no attribute 'fit_pse'"):
+        _ = spt_jax.fit_pse
+
+
+def test_the_penalty_does_not_wait_for_what_only_fits_need():
+    code = "import sys, spt_jax; print('optimistix' in sys.modules, 'scipy.sparse' in sys.modules)"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert printed.stdout.split() == ["False", "False"], printed.stderr
 
 
 def test_signatures():

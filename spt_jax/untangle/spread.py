@@ -10,9 +10,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from spt_jax.mesh_edges import connected
 
@@ -33,13 +32,13 @@ class Surface:
         self.faces = faces[~degenerate]
         self.num_vertices = num_vertices
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
-        links = sparse.coo_matrix(
+        links = scipy.sparse.coo_matrix(
             (np.ones(2 * len(tail)), (np.r_[tail, head], np.r_[head, tail])),
             (num_vertices, num_vertices),
         ).tocsr()
         links.data[:] = 1.0
         self.neighbours: Any = links
-        self.laplacian: Any = sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
+        self.laplacian: Any = scipy.sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
 
     def within(self, start: Int[np.ndarray, "M"], most: int) -> Int[np.ndarray, "_"]:
         """Vertices at most so many edges away from those of `start`, themselves included."""
@@ -109,10 +108,10 @@ class Spread:
         inside = self.patch
         # All rows of L that a vertex of the patch takes part in, so that the displacement goes to
         # zero smoothly: at the patch's rim its Laplacian counts too.
-        bend = sparse.diags(self.reach**2 / 6.0) @ self.surface.laplacian[:, inside]
-        form = sparse.identity(len(inside)) + bend.T @ bend
+        bend = scipy.sparse.diags(self.reach**2 / 6.0) @ self.surface.laplacian[:, inside]
+        form = scipy.sparse.identity(len(inside)) + bend.T @ bend
         # Symmetric and positive definite: no pivoting, which would fill the factors in.
-        return splu(
+        return scipy.sparse.linalg.splu(
             form.tocsc(),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,

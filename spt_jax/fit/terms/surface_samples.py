@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 # Spacing of the surface's samples, as a part of the body's largest extent: 11 mm.
 _SPACING = 1 / 150
@@ -19,7 +19,7 @@ class Surface(NamedTuple):
     corner: Float[np.ndarray, "N 3"]
     area: Float[np.ndarray, "N"]
     normal: Float[np.ndarray, "N 3"]
-    tree: KDTree
+    tree: "scipy.spatial.KDTree"
 
     @property
     def volume(self) -> float:
@@ -65,4 +65,4 @@ def sample_surface(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F
     points = np.einsum("nk,nkc->nc", weight, corners[owner])
     normal = cross[owner] / twice[owner, None]
     size = np.concatenate(area) if face else np.zeros(0)
-    return Surface(points, owner, weight, size, normal, KDTree(points))
+    return Surface(points, owner, weight, size, normal, scipy.spatial.KDTree(points))

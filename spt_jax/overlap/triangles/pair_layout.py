@@ -5,8 +5,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
+import scipy
 from jaxtyping import Bool, Float, Int
 
 # Triangles to a cluster, and clusters to a group. On the posed body 4 make 33,000 pairs of clusters
@@ -48,7 +47,7 @@ class Topology:
     closed: Bool[np.ndarray, "V"]
     used: Bool[np.ndarray, "V"]
     simple: Bool[np.ndarray, "V"]
-    neighbours: scipy.sparse.csr_array
+    neighbours: "scipy.sparse.csr_array"
     entries: Int[np.ndarray, "R 2"]
     fan_start: Int[np.ndarray, "V1"]
     fan: Int[np.ndarray, "F3"]
@@ -75,7 +74,7 @@ class Layout:
     empty: Int[np.ndarray, "P"]
     corners: Int[np.ndarray, "3 S"]
     corners_32: Int[np.ndarray, "3 S"]
-    at_vertices: scipy.sparse.csr_array
+    at_vertices: "scipy.sparse.csr_array"
     sense: Float[np.ndarray, "S"]
     apart: Int[np.ndarray, "2 N"]
 

@@ -10,9 +10,8 @@ On a body this takes 3 ms where those rays take 18: all but some hundred vertice
 """
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from spt_jax.overlap.boundary import area_normals
 from spt_jax.overlap.triangles.pair_boxes import spread
@@ -99,11 +98,11 @@ def _patches(topology: Topology, cut: Int[np.ndarray, "K"], alone: Int[np.ndarra
         indices[there] = end
     there, at = spread(graph.indptr[alone], np.diff(graph.indptr)[alone])
     indices[there] = alone[at]
-    joined = csr_array((graph.data, indices, graph.indptr), shape=graph.shape)
+    joined = scipy.sparse.csr_array((graph.data, indices, graph.indptr), shape=graph.shape)
     # Breadth first finds one part, mostly nearly all, in a quarter of the time for all parts.
     start = int(topology.ends[-1, 0])
     patch = np.full(len(topology.used), -1)
-    reached, _ = breadth_first_order(joined, start)
+    reached, _ = scipy.sparse.csgraph.breadth_first_order(joined, start)
     patch[reached] = 0
     rest = np.flatnonzero(patch < 0)
     if len(rest):
@@ -113,9 +112,11 @@ def _patches(topology: Topology, cut: Int[np.ndarray, "K"], alone: Int[np.ndarra
         to = number[indices[there]]
         kept = np.flatnonzero(to >= 0)
         shape = len(rest), len(rest)
-        links = coo_array((np.ones(len(kept)), (at[kept], to[kept])), shape=shape)
+        links = scipy.sparse.coo_array((np.ones(len(kept)), (at[kept], to[kept])), shape=shape)
         # Of a symmetric graph these are the connected parts, for half the time.
-        _, part = connected_components(links, directed=True, connection="strong")
+        _, part = scipy.sparse.csgraph.connected_components(
+            links, directed=True, connection="strong"
+        )
         patch[rest] = 1 + part
     return patch
 
@@ -126,8 +127,8 @@ def _offsets(first, second, jump, size):
     The difference is in winding numbers; where edges contradict each other, one does not fit.
     """
     count = len(size)
-    links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    num_parts, part = connected_components(links, directed=False)
+    links = scipy.sparse.csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    num_parts, part = scipy.sparse.csgraph.connected_components(links, directed=False)
     ascending = np.argsort(size)
     largest = np.empty(num_parts, np.int64)
     largest[part[ascending]] = ascending  # the last one written stays

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from spt_jax.overlap.triangles.pairs import EdgeCrossings, edge_crossings, face_pairs
 from spt_jax.overlap.triangles.patches import winding_by_patches
@@ -76,8 +75,10 @@ def _regions(faces, winding, pairs, found) -> tuple[int, Int[np.ndarray, "F"]]:
     names, vertex = np.unique(corners[row, corner], return_inverse=True)
     second = np.concatenate([len(found) + vertex, node[pairs[:, 1]]])
     size = len(found) + len(names)
-    links = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(size, size))
-    component = connected_components(links, directed=False)[1][: len(found)]
+    links = scipy.sparse.coo_array(
+        (np.ones(len(first), np.int8), (first, second)), shape=(size, size)
+    )
+    component = scipy.sparse.csgraph.connected_components(links, directed=False)[1][: len(found)]
     used, region[found] = np.unique(component, return_inverse=True)
     return len(used), region
 
