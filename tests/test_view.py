@@ -349,3 +349,21 @@ def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(
         assert view.scene.body.num_vertices == 12_272 and view._status == "two"
     finally:
         assert view.stop_serving()
+
+
+def test_a_body_with_a_hole_is_shown_with_a_note_and_an_edit_ends_a_search(tmp_path):
+    pytest.importorskip("viser", reason="the live view needs viser")
+    from spt_jax.view.server import View
+
+    arrays = ball_arrays()
+    np.savez(tmp_path / "holed.npz", **arrays | {"f": arrays["f"][1:]})
+    view = View(tmp_path / "holed.npz", port=18_775)
+    try:
+        assert len(view._notes) == 1 and "boundary" in view._notes[0]
+        view._untangling = True  # as while a search runs
+        view._do("through", "see_through", False)
+        assert not view._stop.is_set()
+        view._do("slider", "turn_axis", _ELBOW, 1, 10.0)
+        assert view._stop.is_set()
+    finally:
+        view.stop_serving()

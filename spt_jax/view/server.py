@@ -5,12 +5,15 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spt_jax.body import load_body
 from spt_jax.body.pose_files import PoseFile
+from spt_jax.mesh_check import check_mesh
 from spt_jax.view import files
 from spt_jax.view.freeing import untangle_scene
 from spt_jax.view.panel import MEASURES, Panel
@@ -21,6 +24,10 @@ from spt_jax.view.worker import Worker
 # A fist in the belly: something to set free at first sight.
 _FIRST = ("punch", "punch/0013")
 _ERROR_SECONDS = 15.0
+# What ends a search under way: the newest wish counts.
+_EDITS = frozenset(
+    "choose_motion choose_frame turn_axis turn_in_world set_shape reset open_upload open_embedded".split()
+)
 
 
 class View:
@@ -47,12 +54,15 @@ class View:
         with contextlib.redirect_stdout(None):  # its banner; the command says where it serves
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self._stop = threading.Event()
+        self._untangling = False
+        self._notes: list[str] = []
         self._stage = Stage(self.server)
         self._status = "ready"
         self._motions: dict[str, files.Frames] = {}
         self._embedded = True
         self.worker = Worker(self._refresh, self._report)
         self._take(opened if opened is not None else _embedded_body(), file, first=True)
+        self.server.on_client_connect(self._say_notes)
 
     @property
     def url(self) -> str:
@@ -134,9 +144,10 @@ class View:
     def untangle(self) -> None:
         """Set the scene free, every step shown."""
         self._stop.clear()
+        self._untangling = True
         self.panel.show_busy(True)
-        self._show(self.scene.read(), "untangling; the first time takes some seconds to compile")
         before = self.scene.read()
+        self._show(before, "untangling; the first time takes some seconds to compile")
         try:
             untangle_scene(
                 self.scene,
@@ -144,6 +155,7 @@ class View:
                 self._stop.is_set,
             )
         finally:
+            self._untangling = False
             self.panel.show_busy(False)
         self._status = "stopped" if self._stop.is_set() else _outcome(before, self.scene.read())
 
@@ -168,8 +180,9 @@ class View:
     # How.
 
     def _do(self, key: Hashable, action: str, *arguments: Any, **keywords: Any) -> None:
-        if action == "stop":  # not after what it is to stop
-            self._stop.set()
+        if action == "stop" or (self._untangling and action in _EDITS):
+            self._stop.set()  # now, and not after what it is to stop
+        if action == "stop":
             return
         self.worker.post(key, lambda: getattr(self, action)(*arguments, **keywords))
 
@@ -177,7 +190,7 @@ class View:
         self._do(("handle", joint), "turn_in_world", joint, wxyz)
 
     def _take(self, opened: Scene | PoseFile, file: Path | None, *, first: bool) -> None:
-        notes: list[str] = []
+        notes: Sequence[str] = ()
         if isinstance(opened, PoseFile):
             scene = self.scene if not first else _embedded_body()
             if scene.body is None:
@@ -189,6 +202,8 @@ class View:
             scene = opened
             self._embedded = file is None
             motions = {} if scene.body is None else files.mocap_for(scene.body)
+            if scene.body is not None and not self._embedded:
+                notes = check_mesh(np.asarray(scene.body.template), scene.faces).problems
             start = (_FIRST[0], motions[_FIRST[0]].names.index(_FIRST[1])) if motions else None
         if start is not None:
             motions[start[0]].load_into(scene, start[1])
@@ -198,8 +213,9 @@ class View:
         self._stage.begin(scene, reading)
         self.panel = Panel(self.server, scene, motions, start, self._do)
         self._stage.set_handles(scene, self.panel.joints, self._turned)
-        for note in notes:
-            self._notify("Note", note)
+        self._notes = [*notes]
+        for client in self.server.get_clients().values():
+            self._say_notes(client)
 
     def _refresh(self, keys: set[Hashable]) -> None:
         self._show(self.scene.read(), self._status)
@@ -219,11 +235,14 @@ class View:
             traceback.print_exception(error, file=sys.stderr)
             message = f"{type(error).__name__}: {message}"
         self._status = message
-        self._notify("That did not work", message, color="red")
-
-    def _notify(self, title: str, body: str, color: str | None = None) -> None:
         for client in self.server.get_clients().values():
-            client.add_notification(title, body, auto_close_seconds=_ERROR_SECONDS, color=color)
+            client.add_notification(
+                "That did not work", message, auto_close_seconds=_ERROR_SECONDS, color="red"
+            )
+
+    def _say_notes(self, client: Any) -> None:
+        for note in self._notes:
+            client.add_notification("Note", note, auto_close_seconds=_ERROR_SECONDS)
 
 
 def import_viser() -> Any:

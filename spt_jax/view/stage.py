@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
 from spt_jax.overlap.labels import OUT
@@ -75,10 +75,12 @@ class Stage:
         marked = marked_triangles(reading.labels, faces)
         out = marked & (reading.labels[faces] == OUT).any(axis=1)
         with self._server.atomic():
-            self._draw(_VEIL, reading.vertices, faces, ~marked, BODY_COLOUR)
-            self._draw(_CLEAR, reading.vertices, faces, ~marked, BODY_COLOUR)
-            self._draw(_OUT, reading.vertices, faces, out, OUT_COLOUR)
-            self._draw(_IN, reading.vertices, faces, marked & ~out, IN_COLOUR)
+            for chosen, colour, names in (
+                (~marked, BODY_COLOUR, (_VEIL, _CLEAR)),
+                (out, OUT_COLOUR, (_OUT,)),
+                (marked & ~out, IN_COLOUR, (_IN,)),
+            ):
+                self._draw(reading.vertices, faces[chosen], colour, names)
             self.set_see_through(self.see_through)
 
     def set_see_through(self, wanted: bool) -> None:
@@ -122,35 +124,35 @@ class Stage:
 
     def _draw(
         self,
-        name: str,
         vertices: Float[np.ndarray, "V 3"],
         faces: Int[np.ndarray, "F 3"],
-        chosen: Bool[np.ndarray, "F"],
         colour: tuple[int, int, int],
+        names: Sequence[str],
     ) -> None:
         # Only what the triangles use is sent: a few hundred vertices for a spot.
-        used, triangles = np.unique(faces[chosen], return_inverse=True)
-        points, triangles = vertices[used], triangles.reshape(-1, 3)
-        if not len(triangles):
-            if name in self._meshes:
-                self._meshes[name].visible = False
-            points, triangles = vertices[:3], np.zeros((1, 3), np.int64)
-        known = self._meshes.get(name)
-        if known is None:
-            self._meshes[name] = self._server.scene.add_mesh_simple(
-                name,
-                points,
-                triangles,
-                color=colour,
-                opacity=0.0 if name == _VEIL else None,
-                visible=bool(chosen.any()),
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-        elif chosen.any():
-            known.vertices = points.astype(np.float32)
-            known.faces = triangles.astype(np.uint32)
-            known.visible = True
+        used, triangles = np.unique(faces, return_inverse=True)
+        points = vertices[used].astype(np.float32)
+        triangles = triangles.reshape(-1, 3).astype(np.uint32)
+        any_face = bool(len(faces))
+        if not any_face:  # a mesh has to have one
+            points, triangles = np.zeros((3, 3), np.float32), np.zeros((1, 3), np.uint32)
+        for name in names:
+            known = self._meshes.get(name)
+            if known is None:
+                self._meshes[name] = self._server.scene.add_mesh_simple(
+                    name,
+                    points,
+                    triangles,
+                    color=colour,
+                    opacity=0.0 if name == _VEIL else None,
+                    visible=any_face,
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+                continue
+            known.visible = any_face
+            if any_face:
+                known.vertices, known.faces = points, triangles
 
 
 def _listener(joint: int, turned: Turned) -> Any:
