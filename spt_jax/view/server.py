@@ -26,7 +26,8 @@ _FIRST = ("punch", "punch/0013")
 _ERROR_SECONDS = 15.0
 # What ends a search under way: the newest wish counts.
 _EDITS = frozenset(
-    "choose_motion choose_frame turn_axis turn_in_world set_shape reset open_upload open_embedded".split()
+    {"choose_motion", "choose_frame", "turn_axis", "turn_in_world", "set_shape"}
+    | {"reset", "open_upload", "open_embedded"}
 )
 
 
