@@ -2,11 +2,13 @@
 
 from typing import Any, Literal, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Integer
 
+from spt_jax.device.settings import Xla
 from spt_jax.overlap.measure import Directions
 from spt_jax.overlap.rays.beam import Rays, orthogonal_directions
 
@@ -166,16 +168,15 @@ def as_margin(margin: Any) -> float:
 Backend = Literal["auto", "numpy", "xla"]
 
 
-def as_backend(backend: Any) -> Backend:
-    """The backend's name.
+def as_backend(backend: Any) -> Xla | None:
+    """The settings of the device path; None for NumPy's, which "auto" means on a CPU.
 
     Raises:
-        ValueError: an unknown name, or one that this version lacks.
+        ValueError: an unknown name.
     """
+    if isinstance(backend, Xla):
+        return backend
     as_choice("backend", backend, Backend)
-    if backend == "xla":
-        raise ValueError(
-            'backend="xla" is not in this version: got "xla"; use "auto" or "numpy", which also '
-            "work on a GPU, at the price of a transfer to the host."
-        )
-    return backend
+    if backend == "auto":
+        backend = "xla" if jax.default_backend() in ("gpu", "tpu") else "numpy"
+    return Xla() if backend == "xla" else None

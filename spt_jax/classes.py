@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int8, Integer
 
-from spt_jax.arguments import as_choice, as_directions, as_mesh, as_rays
+from spt_jax.arguments import as_backend, as_choice, as_directions, as_mesh, as_rays
+from spt_jax.device.backend import Task, labels_on_device
+from spt_jax.device.settings import Xla
 from spt_jax.exclusions import as_exclusions
 from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
@@ -61,6 +63,7 @@ def classify_vertices(
     face_groups: Integer[Array, "F"] | np.ndarray | None = None,
     ignore_groups: Any = (),
     folds: RestSurface | None = None,
+    backend: str | Xla = "auto",
 ) -> VertexClasses:
     """Sort the vertices into V_0, V_out and V_in (paper, section 3.2).
 
@@ -91,6 +94,7 @@ def classify_vertices(
         face_groups, ignore_groups, folds: overlaps that do not count, as in
             `self_intersection_penalty`; their vertices are V_0. Each connected overlap counts
             whole or not at all.
+        backend: as in `self_intersection_penalty`.
 
     Returns:
         The classes; all V_0 where the penalty is NaN, and V_0 where every ray through the vertex
@@ -118,7 +122,8 @@ def classify_vertices(
     sampling = Sampling(as_rays(rays), as_directions(directions))
     exclusions = as_exclusions(face_groups, ignore_groups, folds, given)
     rounding = float(jnp.finfo(vertices.dtype).eps)
-    options = _Options(as_choice("rule", rule, Rule), sampling, exclusions, rounding)
+    device = as_backend(backend)
+    options = _Options(as_choice("rule", rule, Rule), sampling, exclusions, rounding, device)
     return VertexClasses(_labels(options, vertices, faces))
 
 
@@ -127,10 +132,14 @@ class _Options(NamedTuple):
     sampling: Sampling
     exclusions: Exclusions
     rounding: float  # machine epsilon of the vertices
+    device: Xla | None  # None: the host
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _labels(options, vertices, faces):
+    if options.device is not None:
+        task = Task(options.sampling, options.exclusions, rule=options.rule)
+        return labels_on_device(vertices, faces, options.device, task).astype(jnp.int8)
     results = ((vertices.shape[-2:-1], "int8"),)
     (label,) = call_on_host(_labels_on_host, options, results, vertices, faces)
     return label

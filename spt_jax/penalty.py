@@ -16,6 +16,8 @@ from spt_jax.arguments import (
     as_mesh,
     as_rays,
 )
+from spt_jax.device.backend import Task, penalty_on_device
+from spt_jax.device.settings import Xla
 from spt_jax.exclusions import as_exclusions
 from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host
@@ -39,7 +41,7 @@ def self_intersection_penalty(
     face_groups: Integer[Array, "F"] | np.ndarray | None = None,
     ignore_groups: Any = (),
     folds: RestSurface | None = None,
-    backend: str = "auto",
+    backend: str | Xla = "auto",
 ) -> Float[Array, "*batch"]:
     r"""Volume of a closed mesh's self-intersection, as a loss with its own exact gradient.
 
@@ -83,7 +85,10 @@ def self_intersection_penalty(
         folds: the surface at rest (`body.rest_surface`). Overlaps of sheets nearer to each other
             than its `distance` along it are folds, which bending makes at armpits, elbows and
             groins, and do not count. Which overlaps count is held fixed in the derivative.
-        backend: "auto" or "numpy".
+        backend: "numpy": on the host; "xla", or `spt_jax.device.settings.Xla` with the sizes of its
+            arrays: where the vertices are, by rays alone (`spt_jax.device`); "auto": "xla" where
+            JAX runs on a GPU or TPU. There `rays="auto"` means 512, whose volume is off by the
+            quadrature's error, and folds and groups are told interval by interval.
 
     Returns:
         One number per mesh, in the vertices' dtype. NaN, with a zero gradient, where there is no
@@ -120,7 +125,6 @@ def self_intersection_penalty(
     """
     given = faces
     vertices, faces = as_mesh(vertices, faces)
-    as_backend(backend)
     apart = as_margin(margin)
     options = _Options(
         as_choice("value", value, Value),
@@ -129,6 +133,7 @@ def self_intersection_penalty(
         Sampling(as_rays(rays), as_directions(directions)),
         as_exclusions(face_groups, ignore_groups, folds, given),
         float(jnp.finfo(vertices.dtype).eps),
+        as_backend(backend),
     )
     if apart:
         vertices = inflate(vertices, faces, apart / 2)
@@ -141,6 +146,7 @@ def paper_penalty(
     *,
     rays: int | tuple[int, int] = 512,
     normalize: bool = True,
+    backend: str | Xla = "auto",
 ) -> Float[Array, "*batch"]:
     """The paper to the letter: one direction, Algorithm 1, the ratio, Eq. 10 or 9.
 
@@ -154,6 +160,7 @@ def paper_penalty(
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
         rays: rays along the longer side of the screen, or (rows, columns).
         normalize: Eq. 10, unit vectors, rather than Eq. 9, a third of the area normals.
+        backend: as in `self_intersection_penalty`.
 
     Returns:
         One ratio per mesh, in the vertices' dtype; NaN for vertices that are not finite.
@@ -178,6 +185,7 @@ def paper_penalty(
         rule="triangle",
         rays=rays,
         directions=1,
+        backend=backend,
     )
 
 
@@ -188,15 +196,27 @@ class _Options(NamedTuple):
     sampling: Sampling
     exclusions: Exclusions
     rounding: float  # machine epsilon of the vertices
+    device: Xla | None  # None: the host
+
+    def task(self, *, with_gradient: bool) -> Task:
+        """The same for the device path."""
+        gradient = self.gradient if with_gradient else None
+        return Task(self.sampling, self.exclusions, self.value, gradient, self.rule)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _differentiable(options, vertices, faces):
+    if options.device is not None:
+        task = options.task(with_gradient=False)
+        return penalty_on_device(vertices, faces, options.device, task)[0]
     (value,) = call_on_host(_value_on_host, options, (_scalar(vertices),), vertices, faces)
     return value
 
 
 def _penalty_forward(options, vertices, faces):
+    if options.device is not None:
+        task = options.task(with_gradient=True)
+        return penalty_on_device(vertices, faces, options.device, task)
     results = (_scalar(vertices), (vertices.shape[-2:], vertices.dtype.name))
     # The residual is the gradient: the backward pass never calls the host.
     value, gradient = call_on_host(_value_and_gradient_on_host, options, results, vertices, faces)

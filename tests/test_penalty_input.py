@@ -9,6 +9,7 @@ from helpers import box, embedded_body
 from helpers_penalty import FACES, PAIR, as_jax, loss
 
 from spt_jax import RestSurface, classify_vertices, intersection_report, self_intersection_penalty
+from spt_jax.device.settings import Xla
 from spt_jax.overlap.triangles import pairs
 
 OPTIONS = {
@@ -105,7 +106,7 @@ ERRORS = {
     "flat direction": (_wrong(directions=[0, 0, 1]), ValueError, r"got shape \(3,\)"),
     "named direction": (_wrong(directions="up"), TypeError, "got 'up'"),
     "backend": (_wrong(backend="cuda"), ValueError, "backend must be one of"),
-    "later backend": (_wrong(backend="xla"), ValueError, "not in this version"),
+    "device size": (_wrong(backend=Xla(sorted=0)), ValueError, "sorted must be a positive whole"),
     "negative margin": (_wrong(margin=-0.01), ValueError, "margin must be finite and.*got -0.01"),
     "endless margin": (_wrong(margin=np.inf), ValueError, "margin must be finite"),
     "nan margin": (_wrong(margin=np.float32("nan")), ValueError, "margin must be finite"),

@@ -1,0 +1,1 @@
+"""The penalty without leaving the accelerator: pure JAX, arrays of fixed size."""

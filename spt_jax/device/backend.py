@@ -1,0 +1,186 @@
+"""The penalty and the classes on the device, for meshes of any batch: value, gradient, labels.
+
+Work and memory for one body (V = 12,272 vertices, F = 24,540 triangles), 512 x 512 rays, three
+directions: see `settings`.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Integer
+
+from spt_jax.device.exclusions import which_count
+from spt_jax.device.gradient import as_labels, vertex_gradient
+from spt_jax.device.measure import Found, Usage, Wants, cast_beams, nothing_found
+from spt_jax.device.patches import only_counted
+from spt_jax.device.settings import Xla, meshes_at_once
+from spt_jax.device.winding import vertex_labels
+from spt_jax.overlap.exclusions import NOTHING, Exclusions
+from spt_jax.overlap.measure import _LEAST_EXTENT, Gradient, Rule, Sampling, Value
+
+
+class Task(NamedTuple):
+    """What to find, static.
+
+    Attributes:
+        sampling: the rays.
+        exclusions: what does not count.
+        value, gradient, rule: the options of the penalty; without a gradient it is zero.
+    """
+
+    sampling: Sampling
+    exclusions: Exclusions = NOTHING
+    value: Value = "volume"
+    gradient: Gradient | None = None
+    rule: Rule = "vertex"
+
+
+def penalty_on_device(
+    vertices: Float[Array, "*batch V 3"],
+    faces: Integer[Array, "F 3"],
+    settings: Xla,
+    task: Task,
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch V 3"]]:
+    """Value and gradient of every mesh.
+
+    NaN and zero where a vertex is not finite, a face out of range or a row of the screen did not
+    fit into the arrays.
+    """
+    return _over_batch(_penalty_of_one, task, settings, vertices, faces)
+
+
+def labels_on_device(
+    vertices: Float[Array, "*batch V 3"],
+    faces: Integer[Array, "F 3"],
+    settings: Xla,
+    task: Task,
+) -> Int[Array, "*batch V"]:
+    """The classes of every mesh's vertices; 0 where the mesh cannot be measured."""
+    return _over_batch(_labels_of_one, task, settings, vertices, faces)
+
+
+def usage_on_device(
+    vertices: Float[Array, "*batch V 3"],
+    faces: Integer[Array, "F 3"],
+    settings: Xla,
+    sampling: Sampling,
+) -> Usage:
+    """What the arrays were needed for, mesh by mesh."""
+    return _over_batch(_usage_of_one, Task(sampling), settings, vertices, faces)
+
+
+def _penalty_of_one(vertices, faces, settings: Xla, task: Task):
+    value, gradient = task.value, task.gradient
+    nothing = jnp.zeros((), vertices.dtype), jnp.zeros_like(vertices)
+    usable, clean, faces = _cleaned(vertices, faces)
+    if len(faces) == 0:
+        return jnp.where(usable, nothing[0], jnp.nan), nothing[1]
+    by_class = value == "ratio" or gradient not in (None, "boundary")
+    wants = Wants(value == "volume", gradient == "boundary", by_class and _rays_tell(task))
+    found = _cast(clean, faces, settings, task, wants)
+    usable, result, slope = usable & found.usable, found.volume, found.gradient
+    if by_class:
+        label = _labels(clean, faces, task, found.codes)
+        if value == "ratio":
+            result = jnp.mean((label != 0).astype(vertices.dtype))
+        if gradient not in (None, "boundary"):
+            slope = vertex_gradient(clean, faces, label, unit=gradient == "unit")
+    usable &= jnp.isfinite(result) & jnp.isfinite(slope).all()
+    return jnp.where(usable, result, jnp.nan), jnp.where(usable, slope, nothing[1])
+
+
+def _labels_of_one(vertices, faces, settings: Xla, task: Task):
+    usable, clean, faces = _cleaned(vertices, faces)
+    if len(faces) == 0:
+        return jnp.zeros(len(vertices), jnp.int32)
+    found = _cast(clean, faces, settings, task, Wants(labels=_rays_tell(task)))
+    label = _labels(clean, faces, task, found.codes)
+    return jnp.where(usable & found.usable, label, 0)
+
+
+def _usage_of_one(vertices, faces, settings: Xla, task: Task):
+    _, clean, faces = _cleaned(vertices, faces)
+    if len(faces) == 0:
+        return Usage(*[jnp.int32(0)] * len(Usage._fields))
+    return cast_beams(clean, faces, task.sampling, settings, Wants()).usage
+
+
+def _rays_tell(task: Task) -> bool:
+    return task.rule == "triangle" or task.exclusions.any
+
+
+def _cast(clean, faces, settings: Xla, task: Task, wants: Wants) -> Found:
+    if not any(wants):
+        return nothing_found(clean)
+    return cast_beams(clean, faces, task.sampling, settings, wants, which_count(task.exclusions))
+
+
+def _labels(clean, faces, task: Task, codes: Int[Array, "V"]):
+    if task.rule == "triangle":
+        return as_labels(codes)
+    label = vertex_labels(clean, faces, task.sampling.directions)
+    return only_counted(label, faces, codes > 0) if task.exclusions.any else label
+
+
+def _cleaned(vertices, faces):
+    """Whether the mesh can be measured, and one that surely can, the same where that holds."""
+    if jnp.dtype(faces.dtype).itemsize < 4:
+        faces = faces.astype(jnp.int32)
+    usable = jnp.isfinite(vertices).all() & ((faces >= 0) & (faces < len(vertices))).all()
+    if faces.size:
+        # As `overlap.measure.usable`: rounding has eaten the shape.
+        extent = (vertices.max(axis=0) - vertices.min(axis=0)).max()
+        eaten = _LEAST_EXTENT * float(jnp.finfo(vertices.dtype).eps) * jnp.abs(vertices).max()
+        usable &= ~((extent > 0) & (extent < eaten))
+    faces = jnp.clip(faces, 0, max(len(vertices) - 1, 0)).astype(jnp.int32)
+    return usable, jnp.where(usable, vertices, jnp.zeros_like(vertices)), faces
+
+
+def _over_batch(function: Callable, task: Task, settings: Xla, vertices, faces):
+    batch = vertices.shape[:-2]
+    flat = jax.lax.stop_gradient(vertices).reshape(math.prod(batch), *vertices.shape[-2:])
+    found = _mapped(function, task, settings)(flat, jax.lax.stop_gradient(faces)[None])
+    return jax.tree.map(lambda x: x.reshape(batch + x.shape[1:]), found)
+
+
+@functools.cache
+def _mapped(function: Callable, task: Task, settings: Xla):
+    """The function for a list of meshes, one after the other, also under `vmap`.
+
+    Without this rule `vmap` would give every mesh arrays of its own, and all of them at once.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def mapped(vertices, faces):
+        def one(mesh):
+            own = mesh if len(faces) > 1 else (*mesh, faces[0])
+            return function(*own, settings, task)
+
+        meshes = (vertices, faces) if len(faces) > 1 else (vertices,)
+        if len(vertices) == 1:
+            return jax.tree.map(lambda x: x[None], one([x[0] for x in meshes]))
+        at_once = meshes_at_once(settings, task.sampling.rays, vertices, faces)
+        if at_once == 1:
+            return jax.lax.map(one, meshes)
+        return jax.lax.map(one, meshes, batch_size=at_once)
+
+    @mapped.def_vmap
+    def batched(axis_size, in_batched, vertices, faces):
+        vertices_batched, faces_batched = in_batched
+        if not vertices_batched:
+            vertices = jnp.broadcast_to(vertices[None], (axis_size, *vertices.shape))
+        num_meshes = vertices.shape[1]
+        if faces_batched or faces.shape[0] > 1:
+            if not faces_batched:
+                faces = faces[None]
+            faces = jnp.broadcast_to(faces, (axis_size, num_meshes, *faces.shape[-2:]))
+            faces = faces.reshape(axis_size * num_meshes, *faces.shape[-2:])
+        found = mapped(vertices.reshape(axis_size * num_meshes, *vertices.shape[2:]), faces)
+        found = jax.tree.map(lambda x: x.reshape(axis_size, num_meshes, *x.shape[1:]), found)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return mapped

@@ -1,0 +1,95 @@
+"""Which overlaps count, decided for each interval by its own sheets, as `overlap.exclusions`."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from spt_jax.device.levels import Intervals
+from spt_jax.overlap.exclusions import _UNCONNECTED, Exclusions, _group_table
+
+# The six pairs of the four sheets: opening, first, last and closing, along the ray.
+_PAIRS = {"ol": (0, 2), "fc": (1, 3), "oc": (0, 3), "fl": (1, 2), "of": (0, 1), "cl": (3, 2)}
+
+
+def which_count(exclusions: Exclusions) -> Callable[[Intervals], Bool[Array, "N"]] | None:
+    """A function that tells which intervals count; None where all do."""
+    if not exclusions.any:
+        return None
+    return functools.partial(_apart, exclusions)
+
+
+def _apart(exclusions: Exclusions, intervals: Intervals) -> Bool[Array, "N"]:
+    """Whether the two solids of each interval may collide."""
+    first, last = intervals.ends.T
+    opening, closing = intervals.around.T
+    lone = opening < 0  # inside out: only the two ends are there to compare
+    sheets = jnp.where(lone, first, opening), first, last, jnp.where(lone, last, closing)
+    # The solids are (opening, last) and (first, closing) where they cross, and (opening, closing)
+    # and (first, last) where one lies in the other.
+    length, far, ignored = {}, {}, {}
+    for name, (i, j) in _PAIRS.items():
+        pair = sheets[i], sheets[j]
+        other_group, ignored[name] = _by_groups(exclusions, *pair)
+        length[name] = other_group.astype(jnp.float32)
+        far[name] = jnp.ones(len(first), bool)
+        if exclusions.rest is not None:
+            along = jnp.minimum(_along_rest(exclusions.rest, *pair), _UNCONNECTED)
+            far[name] = along >= exclusions.rest.distance
+            length[name] = length[name] + along
+    crossing = length["ol"] + length["fc"] <= length["oc"] + length["fl"]
+    apart = far["of"] & far["cl"]
+    apart &= jnp.where(crossing, far["oc"] & far["fl"], far["ol"] & far["fc"])
+    apart = jnp.where(lone, far["fl"], apart)
+    # Where several solids overlap in a row, the nearest sheet that opens or closes may be another
+    # solid's. So of two that cross, the sheets that bound the interval tell the pair of groups.
+    nested = ignored["of"] | ignored["cl"] | ignored["ol"] | ignored["fc"]
+    return apart & ~jnp.where(crossing | lone, ignored["fl"], nested)
+
+
+def _by_groups(
+    exclusions: Exclusions, f: Int[Array, "N"], g: Int[Array, "N"]
+) -> tuple[Bool[Array, "N"], Bool[Array, "N"]]:
+    """Whether triangles are of different groups, and whether that pair of groups is ignored."""
+    if exclusions.groups is None or not exclusions.ignored:
+        nothing = jnp.zeros(len(f), bool)
+        return nothing, nothing
+    row, ignored = _group_table(exclusions.groups, exclusions.ignored)
+    row = jnp.asarray(row, jnp.int32)
+    return row[f] != row[g], jnp.asarray(ignored)[row[f], row[g]]
+
+
+def _along_rest(rest, f: Int[Array, "N"], g: Int[Array, "N"]) -> Float[Array, "N"]:
+    """`RestSurface.between_faces`, which is the middle of two bounds."""
+    table = _rest_table(rest)
+    faces = table.nearest.shape[0]
+    person, other = f // faces, g // faces
+    f, g = f % faces, g % faces
+    over_g = table.rows[f, table.nearest[g]]
+    over_f = table.rows[g, table.nearest[f]]
+    upper = jnp.minimum(over_g + table.to_nearest[g], over_f + table.to_nearest[f])
+    lower = jnp.maximum(over_g - table.from_nearest[g], over_f - table.from_nearest[f])
+    return jnp.where(person == other, 0.5 * (jnp.maximum(lower, 0.0) + upper), jnp.inf)
+
+
+class _RestTable:
+    """The shortest paths of a rest surface on the device."""
+
+    def __init__(self, table):
+        with jax.ensure_compile_time_eval():
+            self.rows = jnp.asarray(table.rows)
+            self.nearest = jnp.asarray(np.asarray(table.nearest, np.int32))
+            self.to_nearest = jnp.asarray(table.to_nearest)
+            self.from_nearest = jnp.asarray(table.from_nearest)
+
+
+def _rest_table(rest) -> _RestTable:
+    return _table_on_device(rest._paths)
+
+
+@functools.lru_cache(maxsize=4)
+def _table_on_device(paths) -> _RestTable:
+    return _RestTable(paths._ready())

@@ -1,0 +1,58 @@
+"""Whether the arrays of the device path are large enough for a mesh."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Integer
+
+from spt_jax.arguments import as_directions, as_mesh, as_rays
+from spt_jax.device.backend import usage_on_device
+from spt_jax.device.measure import Usage
+from spt_jax.device.settings import Room, Xla, room
+from spt_jax.overlap.measure import Sampling
+
+
+def device_usage(
+    vertices: Float[Array, "*batch V 3"] | np.ndarray,
+    faces: Integer[Array, "F 3"] | np.ndarray,
+    *,
+    rays: int | tuple[int, int] | str = "auto",
+    directions: Any = 3,
+    settings: Xla | None = None,
+) -> tuple[Usage, Room]:
+    """What `backend="xla"` needs of its arrays for these meshes, and what it has.
+
+    Args:
+        vertices, faces, rays, directions: as in `self_intersection_penalty`.
+        settings: as passed for its `backend`; None: as for "xla".
+
+    Returns:
+        The need of each mesh, and the room. Where the need of `segments`, `crossings` or `sorted`,
+        each of the fullest row of the screen, is more than the room, the penalty is NaN.
+
+    Raises:
+        TypeError, ValueError: as `self_intersection_penalty`.
+
+    Example:
+        >>> import jax.numpy as jnp, trimesh
+        >>> from spt_jax.device.settings import Xla
+        >>> from spt_jax.device.usage import device_usage
+        >>> box = trimesh.creation.box()
+        >>> few = Xla(crossings=100)
+        >>> need, have = device_usage(jnp.asarray(box.vertices, "float32"), box.faces,
+        ...                           rays=64, settings=few)
+        >>> print(have.crossings, int(need.crossings) > 100)
+        100 True
+    """
+    vertices, faces = as_mesh(vertices, faces)
+    settings = settings or Xla()
+    sampling = Sampling(as_rays(rays), as_directions(directions))
+    return _usage(settings, sampling, vertices, faces), room(settings, sampling.rays)
+
+
+def _usage_of(settings, sampling, vertices, faces):
+    return usage_on_device(vertices, faces, settings, sampling)
+
+
+_usage = jax.jit(_usage_of, static_argnums=(0, 1))
