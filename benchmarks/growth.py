@@ -1,0 +1,146 @@
+"""How cost and memory grow with bodies, rays and triangles; the paper's Tables 2 and 3 beside."""
+
+import time
+import tracemalloc
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+from benchmarks.common import Table, progress
+from spt_jax import join_bodies, load_body, load_mocap
+from spt_jax.arguments import as_directions, as_rays
+from spt_jax.overlap.measure import Sampling, measure
+
+# Milliseconds of one iteration, on another machine, in the paper's Tables 2 and 3.
+PAPER_BODIES = {1: 56.76, 2: 89.80, 3: 119.25, 4: 149.58, 5: 186.76}
+PAPER_RAYS = {128: 53.84, 256: 54.96, 512: 56.76, 1024: 58.32, 2048: 59.28}
+SIZES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
+FRAMES = ("crawl/0092", "walk/0010", "run/0010", "jump/0020", "punch/0017")
+_APART = 0.45  # metres between bodies that stand in a row: near, so that some touch
+
+
+class Growth(NamedTuple):
+    """The tables, and what is drawn: cost by triangles."""
+
+    tables: list[Table]
+    triangles: list[int]
+    milliseconds: list[float]
+    megabytes: list[float]
+
+
+def cost(vertices, faces, rays, directions, repeats) -> float:
+    """Median milliseconds of value and gradient, in NumPy alone, after one call."""
+    sampling = Sampling(as_rays(rays), as_directions(directions))
+    taken = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        found = measure(vertices, faces, sampling)
+        _ = found.volume, found.gradient("boundary", "vertex")
+        taken.append(1e3 * (time.perf_counter() - start))
+    return float(np.median(taken[1:]))
+
+
+def peak_megabytes(vertices, faces) -> float:
+    """The most memory that one call holds beyond its input, as Python's allocators see it."""
+    measured = Sampling(as_rays("auto"), as_directions(3))
+    tracemalloc.start()
+    found = measure(vertices, faces, measured)
+    _ = found.volume, found.gradient("boundary", "vertex")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak / 1e6
+
+
+def measure_growth(repeats: int) -> Growth:
+    """All of it."""
+    body, mocap = load_body(), load_mocap()
+    rows = [mocap.names.index(name) for name in FRAMES]
+    place = jnp.arange(len(FRAMES), dtype=jnp.float32)[:, None] * jnp.array([[_APART, 0.0, 0.0]])
+    posed = body(body.pose_from_smpl(jnp.asarray(mocap.pose[jnp.array(rows)])), translation=place)
+    with progress() as bar:
+        task = bar.add_task("growth", total=len(FRAMES) + len(PAPER_RAYS) + len(SIZES))
+        people = []
+        for count in range(1, len(FRAMES) + 1):
+            scene = join_bodies(posed.vertices[:count], body.faces)
+            mesh = np.asarray(scene.vertices, np.float64), np.asarray(scene.faces, np.int64)
+            by_rays, by_default = cost(*mesh, 512, 1, repeats), cost(*mesh, "auto", 3, repeats)
+            people.append((count, by_default, by_rays, PAPER_BODIES[count]))
+            bar.advance(task)
+        one = np.asarray(posed.vertices[0], np.float64), np.asarray(body.faces, np.int64)
+        rays = []
+        for count, theirs in PAPER_RAYS.items():
+            rays.append((count, cost(*one, count, 1, repeats), theirs))
+            bar.advance(task)
+        sizes = []
+        for size in SIZES:
+            mesh = two_balls(size)
+            sizes.append((len(mesh[1]), cost(*mesh, "auto", 3, repeats), peak_megabytes(*mesh)))
+            bar.advance(task)
+    first, auto = people[0], cost(*one, "auto", 3, repeats)
+    tables = [
+        Table(
+            "Bodies in one scene (the paper's Table 3, on its machine), milliseconds and times one",
+            ("bodies", "default", "512 x 512, one direction", "paper"),
+            [
+                (f"{n}", *(f"{x:.1f} ({x / x1:.2f})" for x, x1 in zip(r, first[1:], strict=True)))
+                for n, *r in people
+            ],
+        ),
+        Table(
+            "Rays of one direction (the paper's Table 2), milliseconds and times 128 x 128",
+            ("rays", "ours", "paper"),
+            [
+                (f"{n} x {n}", f"{x:.1f} ({x / rays[0][1]:.2f})", f"{y:.1f} ({y / 53.84:.2f})")
+                for n, x, y in rays
+            ]
+            + [("default, exact to rounding", f"{auto:.1f} ({auto / rays[0][1]:.2f})", "")],
+        ),
+        Table(
+            "Two balls in each other, by triangles: default",
+            ("triangles", "milliseconds", "memory, MB"),
+            [(f"{n:,}", f"{x:.1f}", f"{y:.0f}") for n, x, y in sizes],
+        ),
+    ]
+    return Growth(tables, *([row[k] for row in sizes] for k in range(3)))
+
+
+def two_balls(triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two spheres of about so many triangles in all, a third of a radius in each other."""
+    # 8 n^2 triangles a ball of n rows and 2 n columns.
+    segments = max(round(np.sqrt(triangles / 16)), 4)
+    ball = trimesh.creation.uv_sphere(radius=1.0, count=[segments, 2 * segments])
+    # Turned, so that no triangle of one is that of the other moved along an axis.
+    other = trimesh.transformations.rotation_matrix(1.0, [1.0, 2.0, 3.0])
+    second = ball.copy().apply_transform(other).apply_translation([1.67, 0.2, 0.1])
+    both = trimesh.util.concatenate(ball, second)
+    return np.asarray(both.vertices, np.float64), np.asarray(both.faces, np.int64)
+
+
+def draw_growth(grown: Growth, path: Path) -> None:
+    """Cost and memory against triangles, on logarithmic axes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 3.4), layout="constrained")
+    for axes, values, what in zip(
+        figure.subplots(1, 2),
+        (grown.milliseconds, grown.megabytes),
+        ("milliseconds", "memory, MB"),
+        strict=True,
+    ):
+        axes.loglog(grown.triangles, values, "o-", color="#0072B2")
+        linear = np.array(grown.triangles, float)
+        axes.loglog(
+            grown.triangles,
+            values[-1] * linear / linear[-1],
+            "--",
+            color="#999999",
+            label="in proportion",
+        )
+        axes.set_xlabel("triangles")
+        axes.set_ylabel(what)
+        axes.grid(visible=True, which="major", alpha=0.3)
+        axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)
