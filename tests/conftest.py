@@ -14,7 +14,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 with install_import_hook("spt_jax", "beartype.beartype"):
-    import spt_jax  # noqa: F401
+    import spt_jax
+
+    for name in dir(spt_jax):  # those too that are imported when they are asked for
+        getattr(spt_jax, name)
 
 
 @pytest.fixture(params=["float32", "float64"])
