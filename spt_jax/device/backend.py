@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Integer
 
-from spt_jax.device.exclusions import which_count
 from spt_jax.device.gradient import as_labels, vertex_gradient
-from spt_jax.device.measure import Found, Usage, Wants, cast_beams, nothing_found
-from spt_jax.device.patches import only_counted
+from spt_jax.device.measure import Wants, cast_beams, nothing_found
+from spt_jax.device.patches import spread
 from spt_jax.device.settings import Xla, meshes_at_once
+from spt_jax.device.strips import Usage, no_usage
 from spt_jax.device.winding import vertex_labels
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.overlap.measure import _LEAST_EXTENT, Gradient, Rule, Sampling, Value
@@ -81,8 +81,8 @@ def _penalty_of_one(vertices, faces, settings: Xla, task: Task):
         return jnp.where(usable, nothing[0], jnp.nan), nothing[1]
     by_class = value == "ratio" or gradient not in (None, "boundary")
     wants = Wants(value == "volume", gradient == "boundary", by_class and _rays_tell(task))
-    found = _cast(clean, faces, settings, task, wants)
-    usable, result, slope = usable & found.usable, found.volume, found.gradient
+    found, fits = _cast(clean, faces, settings, task, wants)
+    usable, result, slope = usable & fits, found.volume, found.gradient
     if by_class:
         label = _labels(clean, faces, task, found.codes)
         if value == "ratio":
@@ -97,33 +97,37 @@ def _labels_of_one(vertices, faces, settings: Xla, task: Task):
     usable, clean, faces = _cleaned(vertices, faces)
     if len(faces) == 0:
         return jnp.zeros(len(vertices), jnp.int32)
-    found = _cast(clean, faces, settings, task, Wants(labels=_rays_tell(task)))
+    found, fits = _cast(clean, faces, settings, task, Wants(labels=_rays_tell(task)))
     label = _labels(clean, faces, task, found.codes)
-    return jnp.where(usable & found.usable, label, 0)
+    return jnp.where(usable & fits, label, 0)
 
 
 def _usage_of_one(vertices, faces, settings: Xla, task: Task):
     _, clean, faces = _cleaned(vertices, faces)
     if len(faces) == 0:
-        return Usage(*[jnp.int32(0)] * len(Usage._fields))
-    return cast_beams(clean, faces, task.sampling, settings, Wants()).usage
+        return no_usage()
+    return cast_beams(clean, faces, task.sampling, settings, Wants())[1]
 
 
 def _rays_tell(task: Task) -> bool:
     return task.rule == "triangle" or task.exclusions.any
 
 
-def _cast(clean, faces, settings: Xla, task: Task, wants: Wants) -> Found:
+def _cast(clean, faces, settings: Xla, task: Task, wants: Wants):
     if not any(wants):
-        return nothing_found(clean)
-    return cast_beams(clean, faces, task.sampling, settings, wants, which_count(task.exclusions))
+        return nothing_found(clean), True
+    found, _, fits = cast_beams(clean, faces, task.sampling, settings, wants, task.exclusions)
+    return found, fits
 
 
 def _labels(clean, faces, task: Task, codes: Int[Array, "V"]):
     if task.rule == "triangle":
         return as_labels(codes)
     label = vertex_labels(clean, faces, task.sampling.directions)
-    return only_counted(label, faces, codes > 0) if task.exclusions.any else label
+    if not task.exclusions.any:
+        return label
+    # A connected patch counts whole or not at all.
+    return jnp.where(spread(codes > 0, label != 0, faces), label, 0)
 
 
 def _cleaned(vertices, faces):

@@ -1,25 +1,98 @@
 """Which overlaps count, decided for each interval by its own sheets, as `overlap.exclusions`."""
 
 import functools
-from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from spt_jax.device.gradient import add_codes
 from spt_jax.device.levels import Intervals
+from spt_jax.device.patches import spread
+from spt_jax.device.triangle_pairs import cross_each_other
 from spt_jax.overlap.exclusions import _UNCONNECTED, Exclusions, _group_table
 
 # The six pairs of the four sheets: opening, first, last and closing, along the ray.
 _PAIRS = {"ol": (0, 2), "fc": (1, 3), "oc": (0, 3), "fl": (1, 2), "of": (0, 1), "cl": (3, 2)}
 
 
-def which_count(exclusions: Exclusions) -> Callable[[Intervals], Bool[Array, "N"]] | None:
-    """A function that tells which intervals count; None where all do."""
-    if not exclusions.any:
-        return None
-    return functools.partial(_apart, exclusions)
+class Rims(NamedTuple):
+    """What rays tell of the rims of overlaps, gathered over all of them.
+
+    Attributes:
+        faces: triangles that collide at a rim.
+        colliding: their corners.
+        any: the corners of all triangles at rims.
+        codes: of all vertices at overlaps, as `gradient.add_codes` collects them.
+    """
+
+    faces: Bool[Array, "F"]
+    colliding: Bool[Array, "V"]
+    any: Bool[Array, "V"]
+    codes: Int[Array, "V"]
+
+    def may_count(self, faces: Int[Array, "F 3"]) -> Bool[Array, "V"]:
+        """The vertices of overlaps that have a collision along their rim, or no rim."""
+        overlapped = self.codes > 0
+        rimmed = spread(self.any, overlapped, faces)
+        return spread(self.colliding, overlapped, faces) | (overlapped & ~rimmed)
+
+
+def no_rims(num_vertices: int, num_faces: int) -> Rims:
+    """Before any ray is cast."""
+    vertices, faces = jnp.zeros(num_vertices, bool), jnp.zeros(num_faces, bool)
+    return Rims(faces, vertices, vertices, vertices.astype(jnp.int32))
+
+
+def with_rims(
+    rims: Rims,
+    exclusions: Exclusions,
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    intervals: Intervals,
+) -> Rims:
+    """The rims with what some intervals add.
+
+    An interval whose two triangles pass through each other is at a rim, and collides there where
+    they are far apart at rest. On the host all triangles that do are known; rays find those that
+    they meet.
+    """
+    first, last = intervals.ends.T
+    at_rim = cross_each_other(vertices, faces[first], faces[last]) & (intervals.class_sign != 0)
+    collides = at_rim & ~_by_groups(exclusions, first, last)[1]
+    if exclusions.rest is not None:
+        collides &= _along_rest(exclusions.rest, first, last) >= exclusions.rest.distance
+    ends = intervals.ends.reshape(-1)
+    corners = faces[ends].reshape(-1)
+    return Rims(
+        rims.faces.at[ends].max(jnp.repeat(collides, 2)),
+        rims.colliding.at[corners].max(jnp.repeat(collides, 6)),
+        rims.any.at[corners].max(jnp.repeat(at_rim, 6)),
+        add_codes(rims.codes, faces, intervals),
+    )
+
+
+def which_count(
+    exclusions: Exclusions,
+    intervals: Intervals,
+    faces: Int[Array, "F 3"],
+    rims: Rims | None,
+    may_count: Bool[Array, "V"] | None,
+) -> Bool[Array, "N"]:
+    """Which intervals count.
+
+    Those whose sheets may collide; given the rims, of overlaps that may count, and there those at
+    triangles that collide at the rim too.
+    """
+    apart = _apart(exclusions, intervals)
+    if rims is None or may_count is None:
+        return apart
+    # Two sheets bound an overlap: what is known of either holds for what is between them.
+    corners = faces[intervals.ends.reshape(-1)]
+    allowed = may_count[corners].all(axis=1).reshape(-1, 2).any(axis=1)
+    return allowed & (apart | rims.faces[intervals.ends].any(axis=1))
 
 
 def _apart(exclusions: Exclusions, intervals: Intervals) -> Bool[Array, "N"]:

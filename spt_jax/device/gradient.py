@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from spt_jax.device.levels import Intervals
+from spt_jax.device.strips import Ray
 
 # Labels while they are collected: of several the largest is taken.
 _CODE_INSIDE, _CODE_OUT = 1, 2
@@ -13,9 +14,7 @@ def boundary_gradient(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
     intervals: Intervals,
-    ray_area: Float[Array, ""],
-    direction: Float[Array, "3"],
-    directions: Float[Array, "D 3"],
+    ray: Ray,
 ) -> Float[Array, "V 3"]:
     """One strip's share of the boundary integral; the shares of all beams add up to it."""
     corners = faces[intervals.ends.reshape(-1)]
@@ -24,10 +23,10 @@ def boundary_gradient(
     longest = jnp.abs(normal).max(axis=1)
     normal = normal / jnp.where(longest > 0, longest, jnp.ones_like(longest))[:, None]
     seen = jnp.zeros_like(longest)
-    for k in range(len(directions)):
-        seen = seen + _dot(normal, directions[k]) ** 2
+    for k in range(len(ray.directions)):
+        seen = seen + _dot(normal, ray.directions[k]) ** 2
     sign = jnp.repeat(intervals.class_sign, 2).astype(normal.dtype)
-    weight = sign * jnp.abs(_dot(normal, direction)) * ray_area
+    weight = sign * jnp.abs(_dot(normal, ray.direction)) * ray.area
     weight = weight / jnp.where(seen > 0, seen, jnp.ones_like(seen))
     force = weight[:, None] * normal
     shares = intervals.barycentric.reshape(-1, 3)[:, :, None] * force[:, None, :]

@@ -1,29 +1,28 @@
-"""Connected patches of vertices within overlaps: each counts whole or not at all."""
+"""Connected patches of the surface within overlaps: what is known of one vertex holds for all."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 
-def only_counted(
-    label: Int[Array, "V"], faces: Int[Array, "F 3"], counted: Bool[Array, "V"]
-) -> Int[Array, "V"]:
-    """The labels of the patches in which a vertex is counted, 0 elsewhere.
+def spread(
+    seeds: Bool[Array, "V"], members: Bool[Array, "V"], faces: Int[Array, "F 3"]
+) -> Bool[Array, "V"]:
+    """The members that a path over triangles connects with a seed, through members alone.
 
-    Vertices of class not 0 that share a triangle are one patch. A counted vertex of class 0 counts
-    for the patches that its triangles touch: it is a corner of a triangle cut by the rim.
+    A seed that is no member passes on to the members of its triangles: it is a corner of a triangle
+    that the rim of an overlap cuts.
     """
-    inside = label != 0
 
-    def spread(state):
-        _, kept = state
-        # Over triangles, from any corner to all of class not 0.
-        touched = kept[faces].any(axis=1)
-        wider = jnp.zeros_like(kept).at[faces.reshape(-1)].max(jnp.repeat(touched, 3))
-        wider = kept | (wider & inside)
-        return (wider != kept).any(), wider
+    def over_triangles(vertices):
+        touched = vertices[faces].any(axis=1)
+        wider = jnp.zeros_like(vertices).at[faces.reshape(-1)].max(jnp.repeat(touched, 3))
+        return wider & members
 
-    touched = counted[faces].any(axis=1)
-    start = jnp.zeros_like(counted).at[faces.reshape(-1)].max(jnp.repeat(touched, 3)) & inside
-    _, kept = jax.lax.while_loop(lambda state: state[0], spread, (start.any(), start))
-    return jnp.where(kept, label, 0)
+    def step(state):
+        _, reached = state
+        wider = reached | over_triangles(reached)
+        return (wider != reached).any(), wider
+
+    start = (seeds & members) | over_triangles(seeds)
+    return jax.lax.while_loop(lambda state: state[0], step, (start.any(), start))[1]

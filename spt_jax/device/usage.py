@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import as_directions, as_mesh, as_rays
 from spt_jax.device.backend import usage_on_device
-from spt_jax.device.measure import Usage
 from spt_jax.device.settings import Room, Xla, room
+from spt_jax.device.strips import Usage
 from spt_jax.overlap.measure import Sampling
 
 

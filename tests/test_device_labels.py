@@ -1,0 +1,60 @@
+"""The device path's classes against the host's."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import body_faces, posed_bodies
+from helpers_device import SOLIDS, padded
+
+from spt_jax import classify_vertices
+
+FRAMES = ["crawl/0092", "roll/0056", "run/0010"]
+
+
+def classes(vertices, faces, rule, backend="xla"):
+    return classify_vertices(vertices, faces, rays=48, rule=rule, backend=backend).label
+
+
+on_device = jax.jit(classes, static_argnums=2)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_vertex_rule(name, dtype):
+    mesh = padded(name, dtype)
+    label = on_device(*mesh, "vertex")
+    assert label.dtype == np.int8
+    np.testing.assert_array_equal(label, classes(*mesh, "vertex", "numpy"))
+    assert (name == "apart") == (not label.any())
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_triangle_rule(name):
+    mesh = padded(name, "float32")
+    label = on_device(*mesh, "triangle")
+    np.testing.assert_array_equal(label, classes(*mesh, "triangle", "numpy"))
+    assert (name == "apart") == (not label.any())
+
+
+def test_vertex_rule_of_bodies():
+    bodies = posed_bodies(FRAMES).astype(np.float32)
+    label = on_device(bodies, body_faces().astype(np.int32), "vertex")
+    expected = classes(bodies, body_faces(), "vertex", "numpy")
+    np.testing.assert_array_equal(label, expected)
+    assert (np.count_nonzero(label, axis=1) > 20).all()
+
+
+def test_vertices_by_a_hole():
+    """What the first ray leaves open is told by the next ones, as on the host."""
+    vertices, faces = padded("box in a box", "float32")
+    some = faces.copy()
+    some[2] = 0  # a hole in the outer box
+    expected = classes(vertices, some, "vertex", "numpy")
+    np.testing.assert_array_equal(on_device(vertices, some, "vertex"), expected)
+    assert expected.any()
+
+
+def test_what_cannot_be_measured_is_clear():
+    vertices, faces = padded("two boxes", "float32")
+    vertices[0, 0] = np.nan
+    for rule in ("vertex", "triangle"):
+        assert not on_device(vertices, faces, rule).any()
