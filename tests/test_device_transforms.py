@@ -42,22 +42,18 @@ def check(values, gradients):
     np.testing.assert_allclose(gradients, expected()[1], rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("settings", [Xla(), Xla(meshes_at_once=4)])
-def test_nested_vmap_over_meshes_and_faces(settings):
-    """Also several at once, of which some take more strips than others."""
-    settings = settings._replace(segments=200, crossings=600)
+def test_nested_vmap_over_meshes_and_faces_in_shard_map():
+    """Several meshes at once, of which some take more strips than others, over one device."""
+    settings = Xla(segments=200, crossings=600, meshes_at_once=4)
     vertices, faces = (x.reshape(2, 3, *x.shape[1:]) for x in batch())
     one = jax.value_and_grad(functools.partial(penalty, settings=settings))
-    check(*jax.jit(jax.vmap(jax.vmap(one)))(vertices, faces))
-
-
-def test_shard_map():
-    """Over one device, as `check_vma=False` asks for."""
-    vertices, faces = batch()
     spec = PartitionSpec("meshes")
-    one = jax.vmap(jax.value_and_grad(penalty))
     sharded = jax.shard_map(
-        one, mesh=Mesh(jax.devices()[:1], "meshes"), in_specs=spec, out_specs=spec, check_vma=False
+        jax.vmap(jax.vmap(one)),
+        mesh=Mesh(jax.devices()[:1], "meshes"),
+        in_specs=spec,
+        out_specs=spec,
+        check_vma=False,
     )
     check(*jax.jit(sharded)(vertices, faces))
 

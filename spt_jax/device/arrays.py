@@ -5,9 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-# Of a sum of so few, step by step.
-_FEW = 32
-
 
 def cumulative_sum(numbers: Int[Array, "N"]) -> Int[Array, "N"]:
     """As `jnp.cumsum`, without its tree of additions on a CPU.
@@ -18,27 +15,37 @@ def cumulative_sum(numbers: Int[Array, "N"]) -> Int[Array, "N"]:
 
 
 def _by_rows(numbers):
-    if len(numbers) <= _FEW:
-        columns = numbers[:, None]
-    else:
-        length = int(np.ceil(np.sqrt(len(numbers))))
-        columns = jnp.pad(numbers, (0, -len(numbers) % length)).reshape(-1, length).T
+    length = int(np.ceil(np.sqrt(len(numbers))))
+    columns = jnp.pad(numbers, (0, -len(numbers) % length)).reshape(-1, length).T
 
     def add(total, row):
         return total + row, total + row
 
     # All columns at once, row by row; then what is in the columns before.
     total, sums = jax.lax.scan(add, jnp.zeros_like(columns[0]), columns)
-    if columns.shape[1] > 1:
-        sums = sums + (_by_rows(total) - total)[None, :]
+    index = np.arange(len(total))
+    before = jnp.where(index[None, :] < index[:, None], total[None, :], 0)
+    sums = sums + before.sum(axis=1, dtype=numbers.dtype)[None, :]
     return sums.T.reshape(-1)[: len(numbers)]
+
+
+def take(table: Array, index: Int[Array, "..."]) -> Array:
+    """As `table[index]` for an index that is in range; others are clipped.
+
+    Without this a gather looks for negative indices first, and whether any is out of range.
+    """
+    return table.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
 def indices(mask: Bool[Array, "N"], size: int) -> Int[Array, "M"]:
     """Where the mask is true, in `size` places; N at those that are left."""
     place = jnp.where(mask, cumulative_sum(mask.astype(jnp.int32)) - 1, size)
     index = jnp.arange(len(mask), dtype=jnp.int32)
-    return jnp.full(size, len(mask), jnp.int32).at[place].set(index, mode="drop")
+    return (
+        jnp.full(size, len(mask), jnp.int32)
+        .at[place]
+        .set(index, mode="drop", wrap_negative_indices=False)
+    )
 
 
 def expand(
@@ -53,10 +60,14 @@ def expand(
     end = cumulative_sum(count) - skipped
     start = end - count
     # Indices of no places add to the same mark as the next, so that the sum skips them.
-    marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(start, 0)].add(1, mode="drop")
+    marks = (
+        jnp.zeros(size, jnp.int32)
+        .at[jnp.maximum(start, 0)]
+        .add(1, mode="drop", wrap_negative_indices=False)
+    )
     index = cumulative_sum(marks) - 1
     place = jnp.arange(size, dtype=jnp.int32)
-    return index, place - start[index], place < end[-1]
+    return index, place - take(start, index), place < end[-1]
 
 
 def last_within(total: Int[Array, "R"], begin: Int[Array, ""], most: int) -> Int[Array, ""]:

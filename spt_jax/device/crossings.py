@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.device.arrays import cumulative_sum, expand, indices, last_within
+from spt_jax.device.arrays import cumulative_sum, expand, indices, last_within, take
 from spt_jax.device.beam import Screen
 from spt_jax.overlap.rays.crossings import _EVEN, _SORTED_CORNERS
 from spt_jax.overlap.rays.levels import _NARROWEST
@@ -77,7 +77,7 @@ def cut_by_rows(screen: Screen, faces: Int[Array, "F 3"], num_rows: int) -> Rows
     """The triangles of a beam, ready to be cut into segments."""
     first_row = (screen.row.whole + jnp.ceil(screen.row.part)).astype(jnp.int32)
     first_row = jnp.clip(first_row, 0, num_rows)
-    rows = first_row[faces]
+    rows = take(first_row, faces)
     a, b, c = rows[:, 0], rows[:, 1], rows[:, 2]
     ab, bc, ac = (w.astype(jnp.int32) for w in (a > b, b > c, a > c))
     code = ab + 2 * bc + 4 * ac
@@ -86,7 +86,7 @@ def cut_by_rows(screen: Screen, faces: Int[Array, "F 3"], num_rows: int) -> Rows
     corners = jnp.take_along_axis(faces, order, axis=1).T  # (3, F)
 
     coordinates = [w for fixed in (screen.column, screen.row, screen.depth) for w in fixed]
-    points = jnp.stack(coordinates, axis=1)[corners]  # (3, F, 6)
+    points = take(jnp.stack(coordinates, axis=1), corners)  # (3, F, 6)
     x_whole, x_part, y_whole, y_part, z_whole, z_part = jnp.moveaxis(points, 2, 0)
 
     def between(whole, part, start, end):
@@ -136,9 +136,9 @@ def cut_into_segments(
     """
     first = jnp.clip(rows.low, begin, end)
     face, step, used = expand(jnp.clip(rows.high, begin, end) - first, size)
-    row = first[face] + step
-    shape = rows.shape[face].T
-    upper = row >= rows.mid[face]
+    row = take(first, face) + step
+    shape = take(rows.shape, face).T
+    upper = row >= take(rows.mid, face)
     start = jnp.where(upper[None, :], shape[4:8], shape[0:4])
     start_z = jnp.where(upper, shape[14], jnp.zeros_like(shape[14]))
     slope_x = jnp.where(upper, shape[10], shape[9])
@@ -160,7 +160,7 @@ def cut_into_segments(
     slope = (z[1] - z[0]) / jnp.where(across != 0, across, jnp.ones_like(across))
     skipped = (first_column.astype(x.dtype) - x_whole[0]) - x[0]
     depth = shape[15] + (z[0] + skipped * slope)
-    facing = rows.facing[face]
+    facing = take(rows.facing, face)
     return Segments(
         face=face,
         row=row,
@@ -205,26 +205,25 @@ def cast(
 
     num_rays = num_rows * strip.columns
     first_ray = row * strip.columns + segments.first_column
-    ray = first_ray[of] + step
-    depth = segments.depth[of] + segments.slope[of] * step.astype(segments.depth.dtype)
+    ray = take(first_ray, of) + step
+    depth = take(segments.depth, of)
+    depth = depth + take(segments.slope, of) * step.astype(depth.dtype)
     depth = jnp.clip(depth, 0.0, float(DEPTH_STEPS)).astype(jnp.int32)
-    code = (4 * segments.face + 2 * segments.narrow + segments.leaves)[of]
-    leaves = code % 2
+    code = take(4 * segments.face + 2 * segments.narrow + segments.leaves, of)
     worth, is_open = _worth_sorting(num_rays, ray, depth, code, used)
 
     # Of these rays, as many rows as there is room for.
     by_row = worth.reshape(num_rows, strip.columns).sum(axis=1, dtype=jnp.int32)
     total_worth = jnp.concatenate([jnp.zeros(1, jnp.int32), cumulative_sum(by_row)])
     height = jnp.minimum(height, last_within(total_worth, jnp.int32(0), sizes[1]))
-    sought = used & (ray < height * strip.columns) & (worth[jnp.where(used, ray, 0)] > 0)
+    sought = used & (ray < height * strip.columns) & (take(worth, ray) > 0)
     kept = indices(sought, sizes[1])
     valid = kept < sizes[0]
     kept = jnp.minimum(kept, sizes[0] - 1)
-    ray = jnp.where(valid, ray[kept], num_rays)
+    ray = jnp.where(valid, take(ray, kept), num_rays)
     # At equal depth a ray enters before it leaves, and then by triangle: nothing is left to chance.
-    ray, depth, face = jax.lax.sort(
-        (ray, 2 * depth[kept] + leaves[kept], code[kept] // 4), num_keys=3
-    )
+    depth, code = take(depth, kept), take(code, kept)
+    ray, depth, face = jax.lax.sort((ray, 2 * depth + code % 2, code // 4), num_keys=3)
     sign = jnp.where(ray < num_rays, 1 - 2 * (depth % 2), 0)
     rows_done = jnp.arange(num_rows, dtype=jnp.int32) < height
     is_open = is_open.reshape(num_rows, strip.columns) & rows_done[:, None]
@@ -249,9 +248,19 @@ def _worth_sorting(
     # A triangle seen edge-on is met by rounding alone: nothing on its rays can be told.
     farthest = jnp.where(code // 2 % 2 == 1, _BEYOND, depth)
     zeros = jnp.zeros(2 * num_rays, jnp.int32)
-    count = zeros.at[entry_or_exit].add(1, mode="drop").reshape(-1, 2)
-    first = (zeros + _BEYOND).at[entry_or_exit].min(depth, mode="drop").reshape(-1, 2)
-    last = (zeros - 1).at[entry_or_exit].max(farthest, mode="drop").reshape(-1, 2)
+    count = zeros.at[entry_or_exit].add(1, mode="drop", wrap_negative_indices=False).reshape(-1, 2)
+    first = (
+        (zeros + _BEYOND)
+        .at[entry_or_exit]
+        .min(depth, mode="drop", wrap_negative_indices=False)
+        .reshape(-1, 2)
+    )
+    last = (
+        (zeros - 1)
+        .at[entry_or_exit]
+        .max(farthest, mode="drop", wrap_negative_indices=False)
+        .reshape(-1, 2)
+    )
     entries, exits = count[:, 0], count[:, 1]
     kept = (entries > 2) | ((entries == 2) & (last[:, 0] < first[:, 1]))
     kept |= (first[:, 1] < first[:, 0]) | (last[:, 1] < last[:, 0])

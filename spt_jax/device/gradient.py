@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from spt_jax.device.arrays import take
 from spt_jax.device.levels import Intervals
 from spt_jax.device.strips import Ray
 
@@ -17,7 +18,7 @@ def boundary_gradient(
     ray: Ray,
 ) -> Float[Array, "V 3"]:
     """One strip's share of the boundary integral; the shares of all beams add up to it."""
-    corners = faces[intervals.ends.reshape(-1)]
+    corners = take(faces, intervals.ends.reshape(-1))
     normal = _area_normals(vertices, corners)
     # The weight does not depend on the normal's length; squares of tiny or huge ones would.
     longest = jnp.abs(normal).max(axis=1)
@@ -39,7 +40,7 @@ def add_codes(
     """What the triangle rule says of the ends' corners: V_out before V_in before V_0."""
     sign = jnp.repeat(intervals.class_sign, 6)
     code = jnp.where(sign > 0, _CODE_OUT, jnp.where(sign < 0, _CODE_INSIDE, 0))
-    return codes.at[faces[intervals.ends.reshape(-1)].reshape(-1)].max(code)
+    return codes.at[take(faces, intervals.ends.reshape(-1)).reshape(-1)].max(code)
 
 
 def as_labels(codes: Int[Array, "V"]) -> Int[Array, "V"]:
@@ -62,7 +63,7 @@ def vertex_gradient(
 
 
 def _area_normals(vertices: Float[Array, "V 3"], corners: Int[Array, "K 3"]) -> Float[Array, "K 3"]:
-    a, b, c = (vertices[corners[:, k]] for k in range(3))
+    a, b, c = (take(vertices, corners[:, k]) for k in range(3))
     return jnp.cross(b - a, c - a)
 
 

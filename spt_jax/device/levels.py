@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.device.arrays import cumulative_sum
-from spt_jax.device.beam import Fixed, Screen
+from spt_jax.device.arrays import cumulative_sum, take
+from spt_jax.device.beam import Screen
 from spt_jax.device.crossings import DEPTH_STEPS, Crossings
 from spt_jax.overlap.rays.levels import _THINNEST
 
@@ -62,22 +62,22 @@ def find_overlaps(
     used = (key[1::2] < jnp.iinfo(jnp.int32).max) & (levels != 1)
 
     pair = jnp.stack([opens, closes], axis=1)
-    ends, ray = crossings.face[pair], crossings.ray[opens]
-    corners = faces[ends.reshape(-1)]
+    ends, ray = take(crossings.face, pair), take(crossings.ray, opens)
+    corners = take(_table(screen), take(faces, ends.reshape(-1)))  # (K, 3, 6)
     row = jnp.repeat(begin + ray // columns, 2).astype(screen.pixel.dtype)
     column = jnp.repeat(ray % columns, 2).astype(screen.pixel.dtype)
-    barycentric = _barycentric(screen, corners, row, column)
+    barycentric = _barycentric(corners, row, column)
     # Relative to one corner of the two triangles, where float32 is exact to a millionth of a pixel.
-    base = jnp.repeat(screen.depth.whole[corners[::2, 0]], 2)
-    depth = (barycentric * _relative(screen.depth, corners, base)).sum(axis=1).reshape(-1, 2)
+    base = jnp.repeat(corners[::2, 0, 4], 2)
+    depth = (barycentric * _relative(corners, 2, base)).sum(axis=1).reshape(-1, 2)
     length = jnp.where(used, depth[:, 1] - depth[:, 0], jnp.zeros_like(depth[:, 0]))
 
     # Intervals within an outermost one, of level 2 or 0, form a run with it.
     outermost = used & ((levels == 2) | (levels == 0))
     starts = jnp.zeros(size, jnp.int32).at[opens].add(outermost.astype(jnp.int32))
-    run = cumulative_sum(starts)[opens]
-    of_run = jnp.zeros(size, length.dtype).at[run].add(length)[run]
-    kept = used & (of_run > _thinnest(screen))
+    run = take(cumulative_sum(starts), opens)
+    of_run = jnp.zeros(size, length.dtype).at[run].add(length)
+    kept = used & (take(of_run, run) > _thinnest(screen))
     return Intervals(
         ends=ends,
         around=_around(key, opens, closes, levels, crossings.face, most),
@@ -99,17 +99,22 @@ def _thinnest(screen: Screen) -> Float[Array, ""]:
     return thickness(screen) * max(2.0 * rounding, _THINNEST)
 
 
+def _table(screen: Screen) -> Float[Array, "V 6"]:
+    fixed = screen.column, screen.row, screen.depth
+    return jnp.stack([part for one in fixed for part in one], axis=1)
+
+
 def _relative(
-    fixed: Fixed, corners: Int[Array, "K 3"], base: Float[Array, "K"]
+    corners: Float[Array, "K 3 6"], axis: int, base: Float[Array, "K"]
 ) -> Float[Array, "K 3"]:
-    return (fixed.whole[corners] - base[:, None]) + fixed.part[corners]
+    return (corners[:, :, 2 * axis] - base[:, None]) + corners[:, :, 2 * axis + 1]
 
 
 def _barycentric(
-    screen: Screen, corners: Int[Array, "K 3"], row: Float[Array, "K"], column: Float[Array, "K"]
+    corners: Float[Array, "K 3 6"], row: Float[Array, "K"], column: Float[Array, "K"]
 ) -> Float[Array, "K 3"]:
-    x0, x1, x2 = _relative(screen.column, corners, column).T
-    y0, y1, y2 = _relative(screen.row, corners, row).T
+    x0, x1, x2 = _relative(corners, 0, column).T
+    y0, y1, y2 = _relative(corners, 1, row).T
     weights = jnp.stack([x1 * y2 - y1 * x2, x2 * y0 - y2 * x0, x0 * y1 - y0 * x1])
     total = weights.sum(axis=0)
     weights = weights / jnp.where(total != 0, total, jnp.ones_like(total))[None, :]
@@ -127,7 +132,7 @@ def _around(key, opens, closes, levels, face, most) -> Int[Array, "N 2"]:
     size = len(face)
     below = jnp.maximum((levels - 1 + most) * size + opens, 0)
     close = jnp.clip(jnp.searchsorted(key, below).astype(jnp.int32), 1, size - 1)
-    found = face[jnp.stack([key[close - 1], key[close]], axis=1) % size]
+    found = take(face, take(key, jnp.stack([close - 1, close], axis=1)) % size)
     return jnp.where((levels > 1)[:, None], found, -1)
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.device.arrays import cumulative_sum, expand, last_within
+from spt_jax.device.arrays import cumulative_sum, expand, last_within, take
 from spt_jax.device.cone import within_cone
 from spt_jax.overlap.measure import Directions
 from spt_jax.overlap.triangles.vertex_winding import _SPARE, _THINNEST, _generic_frame
@@ -71,11 +71,11 @@ def _grid(screen: Float[Array, "V 3"]) -> _Grid:
     index = jnp.arange(num, dtype=jnp.int32)
     _, order = jax.lax.sort((screen[:, 1], index), num_keys=1)
     rank = jnp.zeros(num, jnp.int32).at[order].set(index)
-    points = screen[order]
+    points = take(screen, order)
     ascending, along = jax.lax.sort((screen[:, 0], index), num_keys=1)
     rises = jnp.concatenate([jnp.zeros(1, bool), ascending[1:] > ascending[:-1]])
     place = jnp.zeros(num, jnp.int32).at[along].set(cumulative_sum(rises.astype(jnp.int32)))
-    key = index // height * num + place[order]
+    key = index // height * num + take(place, order)
     key, in_order = jax.lax.sort((key, index), num_keys=1)
     return _Grid(points, rank, place, key, in_order, height)
 
@@ -90,7 +90,7 @@ class _Triangles(NamedTuple):
 
 
 def _triangles(grid: _Grid, faces: Int[Array, "F 3"]) -> _Triangles:
-    ranks = grid.rank[faces]
+    ranks = take(grid.rank, faces)
     a, b, c = ranks.T
     low, high = ranks.min(axis=1), ranks.max(axis=1)
     mid = a + b + c - low - high
@@ -123,11 +123,11 @@ def _bounds(
 
     # A row belongs to an edge from its lower end up to below its higher one, and a point on an
     # edge is not to the left of it: of its own corners a triangle contains at most the middle one.
-    contains = _left_of(triangles.edges[:, 0], grid.points[triangles.mid])
+    contains = _left_of(triangles.edges[:, 0], take(grid.points, triangles.mid))
     sign = jnp.where(contains, jnp.where(triangles.even, -1, 1), 0)
     own = jnp.zeros(len(vertices), jnp.int32).at[triangles.mid].add(sign.astype(jnp.int32))
-    least, most, total = (w[grid.rank] for w in _others(grid, triangles, faces, thinnest))
-    own = own[grid.rank]
+    least, most, total = (take(w, grid.rank) for w in _others(grid, triangles, faces, thinnest))
+    own = take(own, grid.rank)
 
     within, has_sides = within_cone(vertices, faces, -frame[2])
     grazed = own == 0
@@ -141,7 +141,7 @@ def _others(
 ) -> tuple[Int[Array, "V"], Int[Array, "V"], Int[Array, "V"]]:
     """By rank: the least and the greatest sum in front of each vertex, and the sum of all."""
     num = len(grid.rank)
-    places = grid.place[faces]
+    places = take(grid.place, faces)
     left, right = places.min(axis=1), places.max(axis=1)
     first = (triangles.low + 1) // grid.height
     strips = (triangles.high - 1) // grid.height - first + 1
@@ -153,17 +153,17 @@ def _others(
     def next_piece(state):
         done, least, most, total = state
         face, step, used = expand(strips, most_runs, done)
-        begin_of = (first[face] + step) * num
-        begin = jnp.searchsorted(grid.key, begin_of + left[face]).astype(jnp.int32)
-        end = jnp.searchsorted(grid.key, begin_of + right[face]).astype(jnp.int32)
+        begin_of = (take(first, face) + step) * num
+        begin = jnp.searchsorted(grid.key, begin_of + take(left, face)).astype(jnp.int32)
+        end = jnp.searchsorted(grid.key, begin_of + take(right, face)).astype(jnp.int32)
         width = jnp.where(used, end - begin, 0)
         sums = jnp.concatenate([jnp.zeros(1, jnp.int32), cumulative_sum(width)])
         taken = last_within(sums, jnp.int32(0), most_pairs)
         width = jnp.where(jnp.arange(most_runs, dtype=jnp.int32) < taken, width, 0)
         run, step, used = expand(width, most_pairs)
-        vertex, face = grid.sorted[jnp.clip(begin[run] + step, 0, num - 1)], face[run]
-        inside = (vertex > triangles.low[face]) & (vertex < triangles.high[face])
-        inside &= used & (vertex != triangles.mid[face])
+        vertex, face = take(grid.sorted, take(begin, run) + step), take(face, run)
+        inside = (vertex > take(triangles.low, face)) & (vertex < take(triangles.high, face))
+        inside &= used & (vertex != take(triangles.mid, face))
         sign, ahead, touches = _crossings(grid, triangles, vertex, face, thinnest)
         sign = jnp.where(inside, sign, 0)
         in_front = jnp.where((ahead < 0) & ~touches, sign, 0)
@@ -187,13 +187,13 @@ def _crossings(
     thinnest: Float[Array, ""],
 ) -> tuple[Int[Array, "P"], Float[Array, "P"], Bool[Array, "P"]]:
     """Sign (0: they do not meet), depth behind the vertex and whether they touch, pair by pair."""
-    upper = vertex >= triangles.mid[face]
-    point, edges = grid.points[vertex], triangles.edges[face]
+    upper = vertex >= take(triangles.mid, face)
+    point, edges = take(grid.points, vertex), take(triangles.edges, face)
     long, short = edges[:, 0], jnp.where(upper[:, None], edges[:, 2], edges[:, 1])
     left_of_short = _left_of(short, point)
     met = _left_of(long, point) != left_of_short
     # Counter-clockwise, facing the ray, where an even triangle has its short edges on the right.
-    sign = jnp.where(met, jnp.where(triangles.even[face] == left_of_short, 1, -1), 0)
+    sign = jnp.where(met, jnp.where(take(triangles.even, face) == left_of_short, 1, -1), 0)
     # Interpolated between the edges, never extrapolated from the plane.
     (x_long, z_long), (x_short, z_short) = _on_row(long, point), _on_row(short, point)
     across = x_short - x_long
@@ -202,7 +202,7 @@ def _crossings(
     # How far the plane is, not how far along the ray.
     near = jnp.abs(ahead) < 1e3 * thinnest
     sign = sign.astype(jnp.int32)
-    return sign, ahead, near & (jnp.abs(ahead) * triangles.tilt[face] <= thinnest)
+    return sign, ahead, near & (jnp.abs(ahead) * take(triangles.tilt, face) <= thinnest)
 
 
 def _on_row(
