@@ -304,7 +304,7 @@ Means with 95 % bootstrap intervals; differences are paired. RE + LR: Wang et al
 Pons-Moll et al. 2015 with spheres fitted to the body. "Without folds":
 `classify_vertices(..., folds=body.rest_surface)`. The prior is learned from the other ten motions.
 Of the weights that `--tune` tried on 16 other scenes, with noise, each method has the one with the
-lowest mean error (RE + SPT with the keypoints alone was not tuned).
+lowest mean error.
 """
 
 
@@ -315,18 +315,30 @@ def main(settings: Settings) -> None:
     else:
         found = tables(settings)
     if settings.record:
-        name = "pose_tuning" if settings.tune else "pose_table"
-        title = "Poses from 2D joints: weights" if settings.tune else "Poses from 2D joints"
-        command = "python -m benchmarks.pose_table" + (" --tune" if settings.tune else "")
-        for option, given, usual in (
-            ("methods", settings.methods, tuple(WEIGHTS)),
-            ("objectives", settings.objectives, OBJECTIVES),
-            ("conditions", settings.conditions, CONDITIONS),
-        ):
-            if tuple(given) != usual:
-                command += f" --{option} " + " ".join(f'"{name}"' for name in given)
-        body = [provenance(f"{command} --record"), _METHOD.strip().format(joints=JOINTS)]
-        record_section(name, title, "\n\n".join([*body, *(one.markdown() for one in found)]))
+        count = len(settings.conditions)
+        for k, objective in enumerate(settings.objectives):
+            record(settings, objective, found[k * count : (k + 1) * count])
+
+
+def record(settings: Settings, objective: str, found: Sequence[Table]) -> None:
+    """Write one objective's tables into results.md."""
+    kind = "pose_tuning" if settings.tune else "pose_table"
+    title = "weights" if settings.tune else "the table"
+    command = "python -m benchmarks.pose_table" + (" --tune" if settings.tune else "")
+    for option, given, usual in (
+        ("methods", settings.methods, tuple(WEIGHTS)),
+        ("objectives", (objective,), ()),
+        ("conditions", settings.conditions, CONDITIONS),
+        ("frames", (str(settings.frames),), (str(TABLE_SCENES),)),
+    ):
+        if tuple(given) != usual:
+            command += f" --{option} " + " ".join(f'"{name}"' for name in given)
+    body = [provenance(f"{command} --record"), _METHOD.strip().format(joints=JOINTS)]
+    record_section(
+        f"{kind}_{OBJECTIVES.index(objective)}",
+        f"Poses from 2D joints, {title}: {objective}",
+        "\n\n".join([*body, *(one.markdown() for one in found)]),
+    )
 
 
 if __name__ == "__main__":

@@ -100,7 +100,7 @@ class SelfIntersection(Regulariser):
     """
 
     name: ClassVar[str] = "spt"
-    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(0.01, 0.1, 1.0))
+    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(0.1, 1.0, 10.0))
     _: dataclasses.KW_ONLY
     folds: Literal["ignore", "count"] = eqx.field(static=True, default="ignore")
     margin: float | Float[Array, ""] = eqx.field(
