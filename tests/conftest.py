@@ -1,5 +1,9 @@
 """Strictness for the whole suite: types checked, promotions explicit, both precisions run."""
 
+import os
+import shutil
+import tempfile
+
 import jax
 import numpy as np
 import pytest
@@ -18,6 +22,22 @@ with install_import_hook("spt_jax", "beartype.beartype"):
 
     for name in dir(spt_jax):  # those too that are imported when they are asked for
         getattr(spt_jax, name)
+
+
+_COMPILED = "SPT_JAX_TESTS_COMPILED"
+
+
+def pytest_configure(config):
+    """One folder of compiled programs for all workers: most of the suite's time is compiling."""
+    if not hasattr(config, "workerinput"):
+        os.environ[_COMPILED] = tempfile.mkdtemp(prefix="spt-jax-tests-")
+    jax.config.update("jax_compilation_cache_dir", os.environ[_COMPILED])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def pytest_unconfigure(config):
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ.pop(_COMPILED), ignore_errors=True)
 
 
 @pytest.fixture(params=["float32", "float64"])
