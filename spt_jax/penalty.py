@@ -86,9 +86,10 @@ def self_intersection_penalty(
             than its `distance` along it are folds, which bending makes at armpits, elbows and
             groins, and do not count. Which overlaps count is held fixed in the derivative.
         backend: "numpy": on the host; "xla", or `spt_jax.device.settings.Xla` with the sizes of its
-            arrays: where the vertices are, by rays alone (`spt_jax.device`); "auto": "xla" where
-            JAX runs on a GPU or TPU. There `rays="auto"` means 512, whose volume is off by the
-            quadrature's error, and folds and groups are told interval by interval.
+            arrays: in JAX alone, where the vertices are; "auto": "xla" where JAX runs on a GPU or
+            TPU, else "numpy". "xla" measures by rays alone: "auto" means 512, 0.04 % off on bodies
+            in the median and 1.6 % at most. Given rays it agrees with "numpy" to 1e-5, but for
+            folds and groups, told from what the rays meet (`spt_jax.device` has the figures).
 
     Returns:
         One number per mesh, in the vertices' dtype. NaN, with a zero gradient, where there is no

@@ -1,8 +1,4 @@
-"""The penalty and the classes on the device, for meshes of any batch: value, gradient, labels.
-
-Work and memory for one body (V = 12,272 vertices, F = 24,540 triangles), 512 x 512 rays, three
-directions: see `settings`.
-"""
+"""The penalty and the classes on the device, for batches of any shape, one mesh after the other."""
 
 import functools
 import math

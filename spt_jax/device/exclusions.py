@@ -78,21 +78,21 @@ def which_count(
     exclusions: Exclusions,
     intervals: Intervals,
     faces: Int[Array, "F 3"],
-    rims: Rims | None,
-    may_count: Bool[Array, "V"] | None,
+    rims: Rims,
+    may_count: Bool[Array, "V"],
 ) -> Bool[Array, "N"]:
     """Which intervals count.
 
-    Those whose sheets may collide; given the rims, of overlaps that may count, and there those at
-    triangles that collide at the rim too.
+    Of overlaps that may count, those whose sheets may collide and those at triangles that collide
+    at the rim.
     """
     apart = _apart(exclusions, intervals)
-    if rims is None or may_count is None:
-        return apart
     # Two sheets bound an overlap: what is known of either holds for what is between them.
     corners = faces[intervals.ends.reshape(-1)]
     allowed = may_count[corners].all(axis=1).reshape(-1, 2).any(axis=1)
-    return allowed & (apart | rims.faces[intervals.ends].any(axis=1))
+    # As on the host: one end at the rim will do where folds are told apart, groups ask for both.
+    at_rim = jnp.any if exclusions.rest is not None else jnp.all
+    return allowed & (apart | at_rim(rims.faces[intervals.ends], axis=1))
 
 
 def _apart(exclusions: Exclusions, intervals: Intervals) -> Bool[Array, "N"]:

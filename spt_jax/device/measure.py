@@ -1,5 +1,6 @@
 """One mesh measured on the device: volume, gradient, the triangle rule's labels, folds."""
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -53,7 +54,7 @@ def cast_beams(
     wants: Wants,
     exclusions: Exclusions = NOTHING,
 ) -> tuple[Found, Usage, Bool[Array, ""]]:
-    """Every beam of the sampling through one mesh; twice where folds have to be told apart.
+    """Every beam of the sampling through one mesh; twice where something does not count.
 
     Args:
         vertices, faces: finite, and in range.
@@ -66,15 +67,17 @@ def cast_beams(
         What was found, what it took, and whether all of it was measured: where it was not, nothing
         of it can be used.
     """
-    rims = may_count = None
-    if exclusions.rest is not None:
+    counted = None
+    if exclusions.any:
         rims = _find_rims(vertices, faces, sampling, settings, exclusions)
         may_count = rims.may_count(faces)
+        counted = functools.partial(
+            which_count, exclusions, faces=faces, rims=rims, may_count=may_count
+        )
 
     def add(found: Found, intervals: Intervals, ray: Ray) -> Found:
-        if exclusions.any:
-            counted = which_count(exclusions, intervals, faces, rims, may_count)
-            intervals = kept_only(intervals, counted)
+        if counted is not None:
+            intervals = kept_only(intervals, counted(intervals))
         if wants.volume:
             # In two steps: float32 sums of many small lengths lose less.
             lengths = jnp.pad(intervals.length, (0, -len(intervals.length) % 256))
