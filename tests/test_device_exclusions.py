@@ -1,0 +1,65 @@
+"""Groups and folds of simple solids on the device."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import join, moved, random_rotation, sphere
+from helpers_device import SOLIDS, padded
+
+from spt_jax import self_intersection_penalty
+from spt_jax.device.patches import spread
+from spt_jax.device.triangle_pairs import cross_each_other
+from spt_jax.overlap.rays.beam import orthogonal_directions
+from spt_jax.overlap.triangles.sheets import find_sheets
+
+
+def test_groups_as_on_the_host():
+    """What two of three boxes share does not count, nor does anything where they are only two."""
+    faces = padded("three boxes", "float32")[1]
+    groups = np.concatenate([np.repeat([0, 1, 2], 12), np.full(len(faces) - 36, 2)])
+
+    def penalty(vertices, faces, backend):
+        return self_intersection_penalty(
+            vertices, faces, rays=48, face_groups=groups, ignore_groups=[(0, 1)], backend=backend
+        )
+
+    both = jax.jit(jax.value_and_grad(penalty), static_argnums=2)
+    found, expected = (both(*padded("three boxes", "float32"), name) for name in ("xla", "numpy"))
+    assert float(found[0]) == pytest.approx(float(expected[0]), rel=1e-5) and found[0] > 0.1
+    scale = np.abs(expected[1]).max()
+    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-5 * scale)
+    value, gradient = both(*padded("two boxes", "float32"), "xla")
+    assert value == 0 and not gradient.any()
+
+
+def test_triangles_that_cross(rng):
+    """The pairs that the host finds on its own, and no others of as many."""
+    vertices, faces = moved(
+        join(sphere(subdivisions=2), sphere(center=(1.2, 0.1, 0.05), subdivisions=2)),
+        random_rotation(rng),
+    )
+    half = len(faces) // 2
+    first, second = np.divmod(np.arange(half * half), half)
+    second += half
+    found = cross_each_other(
+        *(
+            jnp.asarray(x, x.dtype.name.replace("64", "32"))
+            for x in (vertices, faces[first], faces[second])
+        )
+    )
+    pairs = {(f, g) for f, g in zip(first[found], second[found], strict=True)}
+    assert len(pairs) > 30
+    sheets = find_sheets(vertices, faces, np.array(orthogonal_directions(3)))
+    assert pairs == {tuple(sorted(pair)) for pair in sheets.pairs.tolist()}
+
+
+def test_spread_stays_within_a_patch():
+    """From one vertex over its own box of the three, though not over all of it."""
+    _, faces = SOLIDS["three boxes"]
+    members = np.ones(24, bool)
+    members[[8, 9]] = False
+    seeds = np.zeros(24, bool)
+    seeds[12] = True
+    reached = np.flatnonzero(spread(*map(jnp.asarray, (seeds, members, faces.astype(np.int32)))))
+    assert reached.tolist() == [10, 11, 12, 13, 14, 15]
