@@ -7,7 +7,8 @@ What is the same as on the host: the rays, one by one, since both cast them thro
 in the world. In float64 values and gradients agree to 1e-13 and labels are equal (solids, mocap
 frames at 128 and 512 rays). In float32 volumes agree to 2e-7, and gradients to 1e-6 of their
 largest vector on bodies, 1e-5 on boxes; where a ray within rounding of an edge meets the other
-triangle, to 2e-4 at a vertex (1 of 6 frames at 512 rays). Classes by the vertex rule were equal at all vertices of 13 frames.
+triangle, to 2e-4 at a vertex (1 of 6 frames at 512 rays). Classes by the vertex rule were equal at
+all vertices of 13 frames.
 
 What differs:
 
