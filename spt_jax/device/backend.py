@@ -16,7 +16,7 @@ from spt_jax.device.settings import Xla, meshes_at_once
 from spt_jax.device.strips import Usage, no_usage
 from spt_jax.device.winding import vertex_labels
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
-from spt_jax.overlap.measure import _LEAST_EXTENT, Gradient, Rule, Sampling, Value
+from spt_jax.overlap.measure import LEAST_EXTENT, Gradient, Rule, Sampling, Value
 
 
 class Task(NamedTuple):
@@ -134,7 +134,7 @@ def _cleaned(vertices, faces):
     if faces.size:
         # As `overlap.measure.usable`: rounding has eaten the shape.
         extent = (vertices.max(axis=0) - vertices.min(axis=0)).max()
-        eaten = _LEAST_EXTENT * float(jnp.finfo(vertices.dtype).eps) * jnp.abs(vertices).max()
+        eaten = LEAST_EXTENT * float(jnp.finfo(vertices.dtype).eps) * jnp.abs(vertices).max()
         usable &= ~((extent > 0) & (extent < eaten))
     faces = jnp.clip(faces, 0, max(len(vertices) - 1, 0)).astype(jnp.int32)
     return usable, jnp.where(usable, vertices, jnp.zeros_like(vertices)), faces

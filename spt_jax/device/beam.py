@@ -14,9 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.overlap.measure import Sampling
-from spt_jax.overlap.rays.beam import _LADDER_STEPS as LADDER_STEPS
-from spt_jax.overlap.rays.beam import _SHIFT as SHIFT
-from spt_jax.overlap.rays.beam import screen_frame, turned_frame
+from spt_jax.overlap.rays.beam import LADDER_STEPS, SHIFT, screen_frame, turned_frame
 
 # Half of float32's 24 bits: products of two numbers of so many bits are exact.
 _HALF_BITS = 12

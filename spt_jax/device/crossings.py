@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.device.arrays import cumulative_sum, expand, indices, last_within, take
 from spt_jax.device.beam import Screen
-from spt_jax.overlap.rays.crossings import _EVEN, _SORTED_CORNERS
-from spt_jax.overlap.rays.levels import _NARROWEST
+from spt_jax.overlap.rays.crossings import EVEN, SORTED_CORNERS
+from spt_jax.overlap.rays.levels import NARROWEST
 
 # Depths are sorted as whole numbers of this many steps, exact in float32, with a bit to spare.
 DEPTH_STEPS = 2**29 - 2**7
@@ -81,7 +81,7 @@ def cut_by_rows(screen: Screen, faces: Int[Array, "F 3"], num_rows: int) -> Rows
     a, b, c = rows[:, 0], rows[:, 1], rows[:, 2]
     ab, bc, ac = (w.astype(jnp.int32) for w in (a > b, b > c, a > c))
     code = ab + 2 * bc + 4 * ac
-    order = jnp.asarray(_SORTED_CORNERS, jnp.int32)[code]
+    order = jnp.asarray(SORTED_CORNERS, jnp.int32)[code]
     low, mid, high = jnp.take_along_axis(rows, order, axis=1).T
     corners = jnp.take_along_axis(faces, order, axis=1).T  # (3, F)
 
@@ -103,7 +103,7 @@ def cut_by_rows(screen: Screen, faces: Int[Array, "F 3"], num_rows: int) -> Rows
     )
     twice_area = jnp.abs(run[0] * rise[1] - run[1] * rise[0])
     size = jnp.abs(run[:2]).sum(axis=0) + jnp.abs(rise[:2]).sum(axis=0)
-    narrow = twice_area <= _NARROWEST * size
+    narrow = twice_area <= NARROWEST * size
     covered = jnp.stack([high - low, mid - low, high - mid]) > 0
     # An edge between two rows covers none of them, so its slope is never used.
     rise = jnp.where(covered, rise, jnp.ones_like(rise))
@@ -116,7 +116,7 @@ def cut_by_rows(screen: Screen, faces: Int[Array, "F 3"], num_rows: int) -> Rows
         ],
         axis=1,
     )
-    facing = jnp.asarray(_EVEN.astype(np.int32))[code] + 2 * narrow.astype(jnp.int32)
+    facing = jnp.asarray(EVEN.astype(np.int32))[code] + 2 * narrow.astype(jnp.int32)
     change = jnp.zeros(num_rows + 1, jnp.int32).at[low].add(1).at[high].add(-1)
     before = cumulative_sum(cumulative_sum(change))
     before = jnp.concatenate([jnp.zeros(1, jnp.int32), before[:-1]])

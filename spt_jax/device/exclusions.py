@@ -12,7 +12,7 @@ from spt_jax.device.gradient import add_codes
 from spt_jax.device.levels import Intervals
 from spt_jax.device.patches import spread
 from spt_jax.device.triangle_pairs import cross_each_other
-from spt_jax.overlap.exclusions import _UNCONNECTED, Exclusions, _group_table
+from spt_jax.overlap.exclusions import UNCONNECTED, Exclusions, group_table
 
 # The six pairs of the four sheets: opening, first, last and closing, along the ray.
 _PAIRS = {"ol": (0, 2), "fc": (1, 3), "oc": (0, 3), "fl": (1, 2), "of": (0, 1), "cl": (3, 2)}
@@ -110,7 +110,7 @@ def _apart(exclusions: Exclusions, intervals: Intervals) -> Bool[Array, "N"]:
         length[name] = other_group.astype(jnp.float32)
         far[name] = jnp.ones(len(first), bool)
         if exclusions.rest is not None:
-            along = jnp.minimum(_along_rest(exclusions.rest, *pair), _UNCONNECTED)
+            along = jnp.minimum(_along_rest(exclusions.rest, *pair), UNCONNECTED)
             far[name] = along >= exclusions.rest.distance
             length[name] = length[name] + along
     crossing = length["ol"] + length["fc"] <= length["oc"] + length["fl"]
@@ -130,7 +130,7 @@ def _by_groups(
     if exclusions.groups is None or not exclusions.ignored:
         nothing = jnp.zeros(len(f), bool)
         return nothing, nothing
-    row, ignored = _group_table(exclusions.groups, exclusions.ignored)
+    row, ignored = group_table(exclusions.groups, exclusions.ignored)
     row = jnp.asarray(row, jnp.int32)
     return row[f] != row[g], jnp.asarray(ignored)[row[f], row[g]]
 

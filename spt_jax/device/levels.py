@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax.device.arrays import cumulative_sum, take
 from spt_jax.device.beam import Screen
 from spt_jax.device.crossings import DEPTH_STEPS, Crossings
-from spt_jax.overlap.rays.levels import _THINNEST
+from spt_jax.overlap.rays.levels import THINNEST
 
 
 class Intervals(NamedTuple):
@@ -96,7 +96,7 @@ def thickness(screen: Screen) -> Float[Array, ""]:
 def _thinnest(screen: Screen) -> Float[Array, ""]:
     # Twice what the sort may confuse, as on the host; in float32 that is rounding of the depth.
     rounding = max(1.0 / DEPTH_STEPS, 2.0 * float(jnp.finfo(screen.pixel.dtype).eps))
-    return thickness(screen) * max(2.0 * rounding, _THINNEST)
+    return thickness(screen) * max(2.0 * rounding, THINNEST)
 
 
 def _table(screen: Screen) -> Float[Array, "V 6"]:

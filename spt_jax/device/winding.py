@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax.device.arrays import cumulative_sum, expand, last_within, take
 from spt_jax.device.cone import within_cone
 from spt_jax.overlap.measure import Directions
-from spt_jax.overlap.triangles.vertex_winding import _SPARE, _THINNEST, _generic_frame
+from spt_jax.overlap.triangles.vertex_winding import SPARE, THINNEST, generic_frame
 
 # Pieces of the two lists, at most.
 _MOST_RUNS, _MOST_PAIRS = 1 << 16, 1 << 17
@@ -30,8 +30,8 @@ def vertex_labels(
     The first direction serves all vertices; the next ones, and two of our own, those whose ray met
     a hole. A vertex that no direction decides is 0, and so is one that no triangle uses.
     """
-    rows = [*(np.array(direction) for direction in directions), *_SPARE]
-    frames = jnp.asarray(np.stack([_generic_frame(row) for row in rows]), vertices.dtype)
+    rows = [*(np.array(direction) for direction in directions), *SPARE]
+    frames = jnp.asarray(np.stack([generic_frame(row) for row in rows]), vertices.dtype)
     used = jnp.zeros(len(vertices), jnp.int32).at[faces.reshape(-1)].max(1) > 0
 
     def more(state):
@@ -119,7 +119,7 @@ def _bounds(
     grid = _grid(screen)
     triangles = _triangles(grid, faces)
     extent = (screen.max(axis=0) - screen.min(axis=0)).max()
-    thinnest = max(_THINNEST, 4 * float(jnp.finfo(vertices.dtype).eps)) * extent
+    thinnest = max(THINNEST, 4 * float(jnp.finfo(vertices.dtype).eps)) * extent
 
     # A row belongs to an edge from its lower end up to below its higher one, and a point on an
     # edge is not to the left of it: of its own corners a triangle contains at most the middle one.

@@ -19,7 +19,7 @@ from spt_jax.overlap.rays.levels import Overlaps
 from spt_jax.overlap.triangles.sheets import Sheets
 
 # Between parts that no path along the rest surface connects.
-_UNCONNECTED = 1e6
+UNCONNECTED = 1e6
 
 
 class Rest(Protocol):
@@ -158,7 +158,7 @@ def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
     far = {name: np.ones(len(first), bool) for name in pairs}
     if exclusions.rest is not None:
         for name, pair in pairs.items():
-            along = np.minimum(exclusions.rest.between_faces(*pair), _UNCONNECTED)
+            along = np.minimum(exclusions.rest.between_faces(*pair), UNCONNECTED)
             far[name] = along >= exclusions.rest.distance
             length[name] = length[name] + along
     crossing = length["ol"] + length["fc"] <= length["oc"] + length["fl"]
@@ -174,19 +174,19 @@ def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
 def _ignored(exclusions: Exclusions, f, g) -> Bool[np.ndarray, "N"]:
     if exclusions.groups is None or not exclusions.ignored:
         return np.zeros(len(f), bool)
-    groups, ignored = _group_table(exclusions.groups, exclusions.ignored)
+    groups, ignored = group_table(exclusions.groups, exclusions.ignored)
     return ignored[groups[f], groups[g]]
 
 
 def _group_distance(exclusions: Exclusions, f, g) -> Float[np.ndarray, "N"]:
     if exclusions.groups is None:
         return np.zeros(len(f))
-    groups, _ = _group_table(exclusions.groups, exclusions.ignored)
+    groups, _ = group_table(exclusions.groups, exclusions.ignored)
     return 1.0 * (groups[f] != groups[g])
 
 
 @functools.lru_cache(maxsize=8)
-def _group_table(groups: bytes, pairs: tuple[tuple[int, int], ...]):
+def group_table(groups: bytes, pairs: tuple[tuple[int, int], ...]):
     """Each face's group as a row of a table of the ignored pairs, and that table."""
     names, row = np.unique(np.frombuffer(groups, np.int64), return_inverse=True)
     ignored = np.zeros((len(names), len(names)), bool)

@@ -33,7 +33,7 @@ Rule = Literal["vertex", "triangle"]
 
 # Of a mesh, in units in the last place of its largest coordinate. In float32 a body that stands 14
 # km from the origin is this small: its triangles are as large as the rounding.
-_LEAST_EXTENT = 1024
+LEAST_EXTENT = 1024
 
 
 class Sampling(NamedTuple):
@@ -250,5 +250,5 @@ def usable(
     if faces.size == 0:
         return True
     extent = np.ptp(vertices, axis=0).max()
-    far = 0 < extent < _LEAST_EXTENT * rounding * np.abs(vertices).max()
+    far = 0 < extent < LEAST_EXTENT * rounding * np.abs(vertices).max()
     return bool(not far and faces.min() >= 0 and faces.max() < len(vertices))

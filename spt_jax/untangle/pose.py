@@ -293,7 +293,7 @@ def _untangle_one(
                 jnp.asarray(weight, pose.dtype),
             )
             steps += int(taken)
-            candidate = _turned(pose, factor, moved)
+            candidate = turned(pose, factor, moved)
             posed = body(candidate, shape, translation).vertices
             overlap = search.measure(posed, body.faces)
             gained = search.rank(overlap) < search.rank(after)
@@ -326,7 +326,7 @@ def _displacement_factor(body, pose, shape):
     return jnp.linalg.cholesky(form + _STIFFNESS * jnp.eye(len(form), dtype=form.dtype))
 
 
-def _turned(pose, factor, moved):
+def turned(pose, factor, moved):
     """The pose whose linearised displacement, in centimetres, has the squared norm of `moved`."""
     turn = jax.scipy.linalg.solve_triangular(factor, moved, trans=1, lower=True)
     return pose.at[1:].add(_CENTIMETRE * turn.reshape(pose[1:].shape))
@@ -336,7 +336,7 @@ def _turned(pose, factor, moved):
 def _descend(search: _Search, body, fixed, moved, margin, weight):
     def objective(moved, arguments):
         body, (pose, shape, translation, factor), margin, weight = arguments
-        vertices = body(_turned(pose, factor, moved), shape, translation).vertices
+        vertices = body(turned(pose, factor, moved), shape, translation).vertices
         if search.margin:
             vertices = inflate(vertices, body.faces, margin / 2)
         volume = self_intersection_penalty(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from spt_jax.arguments import as_directions
 from spt_jax.overlap.measure import Sampling
 from spt_jax.untangle.mesh import SEARCH_RAYS, untangle_checked
-from spt_jax.untangle.pose import _turned, untangle_pose
+from spt_jax.untangle.pose import turned, untangle_pose
 from spt_jax.untangle.spread import Surface
 from spt_jax.view.scene import Scene
 
@@ -71,8 +71,8 @@ class _Watched(optx.AbstractMinimiser):
     def step(self, fn, y, args, options, state, tags):
         y, state, aux = self.inner.step(fn, y, args, options, state, tags)
         body, (pose, shape, translation, factor), *_ = args
-        turned = _turned(pose, factor, y)
-        flat = body(turned, shape, translation).vertices.reshape(-1)
+        at = turned(pose, factor, y)
+        flat = body(at, shape, translation).vertices.reshape(-1)
         pieces = [flat[start : start + _PIECE] for start in range(0, flat.size, _PIECE)]
         jax.debug.callback(self.relay, turned, *pieces)
         return y, state, aux

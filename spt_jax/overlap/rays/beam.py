@@ -12,7 +12,7 @@ Rays = int | tuple[int, int] | Literal["auto"]
 
 # Pixel sizes come from this many steps per factor of two. Coarse enough that a mesh which moves
 # a little keeps its pixel, fine enough that `rays` means what it says to within 9 %.
-_LADDER_STEPS = 8
+LADDER_STEPS = 8
 
 # A square screen is turned about its rays by the angle whose tangent is the golden ratio's
 # fractional part. Slivers of overlap tend to lie along the axes (armpits and groins of an upright
@@ -24,7 +24,7 @@ _TURN = np.arctan((np.sqrt(5.0) - 1.0) / 2.0)
 
 # No ray goes through the world's origin or along its axes: that is where modelled objects have
 # their vertices and faces, and a face seen exactly edge-on is seen by luck alone.
-_SHIFT = np.array([0.3819660112501051, 0.2763932022500210])
+SHIFT = np.array([0.3819660112501051, 0.2763932022500210])
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def on_lattice(
     column /= pixel[0]
     row /= pixel[1]
     lowest = np.array([column.min(), row.min()])
-    origin = np.floor((lowest + _SHIFT) / block) * block - _SHIFT
+    origin = np.floor((lowest + SHIFT) / block) * block - SHIFT
     column -= origin[0]
     row -= origin[1]
     shape = (int(row.max()) + 2, int(column.max()) + 2)
@@ -165,4 +165,4 @@ def on_lattice(
 def _ladder(wanted: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
     # A mesh without extent has no crossings; any pixel will do.
     wanted = np.where(wanted > 0, wanted, 1.0)
-    return np.exp2(np.floor(_LADDER_STEPS * np.log2(wanted) + 1e-9) / _LADDER_STEPS)
+    return np.exp2(np.floor(LADDER_STEPS * np.log2(wanted) + 1e-9) / LADDER_STEPS)

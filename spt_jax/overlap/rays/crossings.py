@@ -24,10 +24,10 @@ _MOST_DEPTH_BITS = 32
 
 # (a > b) + 2 (b > c) + 4 (a > c) -> the order of corners that sorts rows a, b, c; the codes 2 + 0
 # and so on that contradict themselves cannot occur.
-_SORTED_CORNERS = np.array(
+SORTED_CORNERS = np.array(
     [[0, 1, 2], [1, 0, 2], [0, 2, 1], [0, 1, 2], [0, 1, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]]
 )
-_EVEN = np.array([True, False, False, True, True, True, True, False])
+EVEN = np.array([True, False, False, True, True, True, True, False])
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,8 @@ def _spans(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> _Spans:
     a, b, c = first_row[faces[:, 0]], first_row[faces[:, 1]], first_row[faces[:, 2]]
     face = np.flatnonzero((a != b) | (b != c))  # the others lie between two rows
     code = ((a > b) + 2 * (b > c) + 4 * (a > c))[face]
-    corners = faces.ravel()[3 * face + _SORTED_CORNERS[code].T]  # (3, F): low, mid, high
-    even = _EVEN[code]
+    corners = faces.ravel()[3 * face + SORTED_CORNERS[code].T]  # (3, F): low, mid, high
+    even = EVEN[code]
     x, y, z = points.column[corners], points.row[corners], points.depth[corners]
     low, mid, high = first_row[corners]
 

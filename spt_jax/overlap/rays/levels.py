@@ -22,11 +22,11 @@ from spt_jax.overlap.rays.crossings import Crossings
 
 # A triangle seen edge-on is a line on the screen. Narrower than this, in pixels, rounding decides
 # which rays hit it and at which of its depths, and nothing on such a ray can be told.
-_NARROWEST = 1e-5
+NARROWEST = 1e-5
 
 # Overlaps thinner than this part of the mesh's depth are no overlaps: where a ray grazes a
 # silhouette, the order of two crossings at one depth is a matter of rounding.
-_THINNEST = 1e-7
+THINNEST = 1e-7
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def find_overlaps(
     outermost = np.zeros(len(level), bool)
     outermost[pair[(levels == 2) | (levels == 0), 0]] = True
     run = np.cumsum(outermost)[pair[:, 0]]
-    thinnest = max(2 * crossings.depth_quantum, _THINNEST * np.ptp(points.depth))
+    thinnest = max(2 * crossings.depth_quantum, THINNEST * np.ptp(points.depth))
     kept = np.bincount(run, length)[run] > thinnest if len(run) else np.zeros(0, bool)
     return Overlaps(
         ray=crossings.ray[pair[:, 0]],
@@ -130,7 +130,7 @@ def _edge_on(
     twice_area = np.abs((x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0))
     size = np.abs(x1 - x0) + np.abs(y1 - y0) + np.abs(x2 - x0) + np.abs(y2 - y0)
     narrow = np.zeros(len(faces), bool)
-    narrow[met[twice_area <= _NARROWEST * size]] = True
+    narrow[met[twice_area <= NARROWEST * size]] = True
     return narrow[hit]
 
 

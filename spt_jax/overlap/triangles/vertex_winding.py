@@ -28,10 +28,10 @@ _LEAN = (0.1381966011250105, 0.0901699437494742)
 _TURN = np.arctan((np.sqrt(5.0) - 1.0) / 2.0)
 
 # For vertices whose rays meet a hole in all of the caller's directions.
-_SPARE = np.array([[0.48, -0.36, -0.8], [-0.64, 0.6, -0.48]])
+SPARE = np.array([[0.48, -0.36, -0.8], [-0.64, 0.6, -0.48]])
 
 # A sheet nearer to the vertex than this part of the mesh's size touches it, as in `rays.levels`.
-_THINNEST = 1e-7
+THINNEST = 1e-7
 
 # How many strips the screen is cut into, and columns, for each root of the number of vertices.
 # With fewer strips a triangle is paired with more vertices that it cannot contain, with more it
@@ -78,13 +78,13 @@ def vertex_winding(
     undecided = np.zeros(len(vertices), bool)
     undecided[faces.ravel() if sample is None else sample] = True
     with np.errstate(all="ignore"):  # what is not finite compares as false, and counts as 0
-        for direction in (*directions, *_SPARE):
+        for direction in (*directions, *SPARE):
             sample = np.flatnonzero(undecided)
             if len(sample) == 0:
                 break
-            frame = _generic_frame(direction)
+            frame = generic_frame(direction)
             screen = frame @ vertices.T
-            thinnest = _THINNEST * float(np.ptp(screen, axis=1).max())
+            thinnest = THINNEST * float(np.ptp(screen, axis=1).max())
             few = len(sample) < _FEW * len(vertices)
             near = faces[around(screen, faces, sample)] if few else faces
             own, least, most, total = _sums(*used_alone(screen, near, sample), thinnest)
@@ -101,7 +101,8 @@ def vertex_winding(
     return winding
 
 
-def _generic_frame(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def generic_frame(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The frame of rays along a direction, leant and turned away from everything modelled."""
     u, v, d = screen_frame(direction.astype(np.float64))
     return screen_frame(d + _LEAN[0] * u + _LEAN[1] * v, _TURN)
 
