@@ -1,57 +1,24 @@
 """The paper's Table 1 on real motion capture: `python -m benchmarks.pose_table`.
 
 Poses are fitted to 22 projected joints by each method, all from the same starts and with the same
-numbers of steps; `pose_scenes.py` says what the scenes are. Once the objective is the paper's, the
-keypoints and the regulariser alone, and once it has what `fit_pose` adds by default, a prior (of
-the other motions) and joint limits. `--tune` fits other scenes with rising weights; those in
-WEIGHTS are the best that it found for each method.
+numbers of steps; `pose_scenes.py` says what the scenes are, `pose_fits.py` what the methods are.
+Once the objective is the paper's, the keypoints and the regulariser alone, and once it has what
+`fit_pose` adds by default, a prior (of the other motions) and joint limits. `--tune` fits other
+scenes with rising weights; those in `pose_fits.WEIGHTS` are the best that it found for each method.
 """
 
-import time
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
-from benchmarks.pose_scenes import JOINTS, Scene, camera, prior_without, stored_scenes
-from spt_jax import classify_vertices, fit_pose, load_body
-from spt_jax.fit.terms.regularisers import (
-    Laplacian,
-    Nothing,
-    Regulariser,
-    SelfIntersection,
-    Spheres,
-)
+from benchmarks.pose_fits import CONDITIONS, OBJECTIVES, TRIED, WEIGHTS, Fitter, fitted, seconds
+from benchmarks.pose_scenes import JOINTS, Scene, stored_scenes
 
 TABLE_SCENES = 139  # as many as the paper's reduced test set of UP-3D
-RISE = (0.01, 0.1, 1.0)  # of each method's weight, stage by stage
-PAPER_RATE = 0.1  # gradient descent in coordinates in which the keypoints' cost is round
-
-# The last weight of each method, keypoints alone and with prior and limits: see --tune.
-WEIGHTS = {
-    "RE": (0.0, 0.0),
-    "RE + LR": (10.0, 0.1),
-    "RE + SA": (10.0, 3.0),
-    "RE + SPT": (1.0, 10.0),
-    "RE + SPT, paper": (1e-2, 1e-2),
-}
-TRIED = {
-    "RE + LR": (0.1, 1.0, 10.0, 100.0),
-    "RE + SA": (0.1, 0.3, 1.0, 3.0, 10.0),
-    "RE + SPT, paper": (1e-3, 1e-2, 0.1, 1.0),
-    "RE + SPT": (0.1, 1.0, 10.0),
-}
-OBJECTIVES = ("keypoints alone", "prior and limits")
-CONDITIONS = ("exact joints", "5 px noise, 10 % missing")
 
 
 @dataclass
@@ -73,110 +40,6 @@ class Settings:
     """An .npz of the scenes; read where it exists, and written."""
     record: bool = False
     """Write the tables into results.md."""
-
-
-class Outcome(NamedTuple):
-    """What a fit came to."""
-
-    error: float  # mean distance of the vertices, pelvis on pelvis, mm
-    inside: float  # vertices in self-intersection, per cent
-    inside_without_folds: float
-
-
-@dataclass
-class Fitter:
-    """The fits of one method under one objective."""
-
-    method: str
-    objective: str
-    weight: float
-    body: object = field(default_factory=load_body)
-
-    def regulariser(self) -> Regulariser:
-        """The method's term, its weight rising over the same stages for all."""
-        weights = tuple(self.weight * share for share in RISE)
-        if self.method == "RE":
-            return Nothing(weights)
-        if self.method == "RE + LR":
-            return Laplacian(weights)
-        if self.method == "RE + SA":
-            return Spheres(weights)
-        if self.method == "RE + SPT":
-            return SelfIntersection(weights)
-        # Section 4.3: Eqs. 10 and 11, Algorithm 1, one direction, folds and all, gradient descent.
-        return SelfIntersection(
-            weights,
-            folds="count",
-            value="ratio",
-            gradient="unit",
-            rule="triangle",
-            rays=512,
-            directions=1,
-        )
-
-    def __call__(self, some: Sequence[Scene], condition: str):
-        """Fit scenes of one motion in one batch."""
-        plain = self.objective == OBJECTIVES[0]
-        exact = condition == CONDITIONS[0]
-        return fit_pose(
-            self.body,
-            np.stack([scene.exact if exact else scene.noisy for scene in some]),
-            camera(),
-            joints="smpl",
-            confidence=None if exact else np.stack([scene.seen for scene in some]),
-            shape=np.stack([scene.shape for scene in some]),
-            regulariser=self.regulariser(),
-            # Its mean is where the search starts, whatever it weighs.
-            prior=prior_without(some[0].motion),
-            prior_weight=0.0 if plain else 1.0,
-            limits=None if plain else "anatomical",
-            upright_weight=0.0 if plain else 0.25,
-            solver=optx.GradientDescent(PAPER_RATE, rtol=1e-3, atol=1e-3)
-            if self.method.endswith("paper")
-            else None,
-        )
-
-
-def fitted(fitter: Fitter, some: Sequence[Scene], condition: str) -> Iterator[tuple[int, Outcome]]:
-    """The outcome of each scene with its place in the list, a motion at a time."""
-    by_motion = defaultdict(list)
-    for place, scene in enumerate(some):
-        by_motion[scene.motion].append(place)
-    for places in by_motion.values():
-        chosen = [some[place] for place in places]
-        outcomes = judged(fitter.body, chosen, fitter(chosen, condition))
-        yield from zip(places, outcomes, strict=True)
-
-
-def judged(body, some: Sequence[Scene], result) -> list[Outcome]:
-    """What the columns are made of."""
-    truth = body(*(jnp.stack([getattr(s, name) for s in some]) for name in ("pose", "shape")))
-    away = result.vertices - result.joints[:, :1] - truth.vertices + truth.joints[:, :1]
-    error = 1e3 * np.asarray(jnp.linalg.norm(away, axis=-1).mean(axis=-1))
-    ratios = [np.asarray(one) for one in _ratios()(result.vertices)]
-    return [Outcome(*map(float, row)) for row in zip(error, *ratios, strict=True)]
-
-
-@cache
-def _ratios():
-    body = load_body()
-    rest = body.rest_surface
-    return jax.jit(
-        lambda vertices: tuple(
-            100 * classify_vertices(vertices, body.faces, folds=folds).ratio
-            for folds in (None, rest)
-        )
-    )
-
-
-def seconds(fitter: Fitter, some: Sequence[Scene], condition: str) -> float:
-    """Median time of a fit of one scene, compiled before."""
-    taken = []
-    for scene in (some[0], *some):
-        start = time.perf_counter()
-        jax.block_until_ready(fitter([scene], condition).pose)
-        taken.append(time.perf_counter() - start)
-    return float(np.median(taken[1:]))
 
 
 def interval(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
