@@ -31,7 +31,8 @@ def pytest_configure(config):
     """One folder of compiled programs for all workers: most of the suite's time is compiling."""
     if not hasattr(config, "workerinput"):
         os.environ[_COMPILED] = tempfile.mkdtemp(prefix="spt-jax-tests-")
-    jax.config.update("jax_compilation_cache_dir", os.environ[_COMPILED])
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        jax.config.update("jax_compilation_cache_dir", os.environ[_COMPILED])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 

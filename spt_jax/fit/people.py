@@ -131,17 +131,19 @@ def fit_people(
         body, keypoints, camera, **{**defaults, **options, "regulariser": scene}, in_scene=count
     )
     best, before = alone, _penetration(body, alone)
-    after, fits, steps = before, alone, jnp.array(0)
-    last = as_weights(weights)[-1:]
-    attempts = [(gap, as_weights(weights))] + [(gap * more, last) for more in _WIDER if gap]
-    for attempt, rising in attempts:
-        changed = dataclasses.replace(
-            setup.regulariser, margin=jnp.asarray(attempt), weights=rising
-        )
-        fits, taken = _descend_together(
-            dataclasses.replace(setup, regulariser=changed), people, best
-        )
-        steps = steps + taken
+    after, steps = before, jnp.array(0)
+    rising = list(as_weights(weights)[:, None])
+    attempts = [(gap, rising)] + [(gap * more, rising[-1:]) for more in _WIDER if gap]
+    for attempt, stages in attempts:
+        fits = best
+        for weight in stages:  # one stage a call: all are one program
+            changed = dataclasses.replace(
+                setup.regulariser, margin=jnp.asarray(attempt), weights=weight
+            )
+            fits, taken = _descend_together(
+                dataclasses.replace(setup, regulariser=changed), people, fits
+            )
+            steps = steps + taken
         found = _penetration(body, fits)
         if _rank(found) < _rank(after):
             best, after = fits, found

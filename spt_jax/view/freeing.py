@@ -74,7 +74,7 @@ class _Watched(optx.AbstractMinimiser):
         at = turned(pose, factor, y)
         flat = body(at, shape, translation).vertices.reshape(-1)
         pieces = [flat[start : start + _PIECE] for start in range(0, flat.size, _PIECE)]
-        jax.debug.callback(self.relay, turned, *pieces)
+        jax.debug.callback(self.relay, at, *pieces)
         return y, state, aux
 
     def terminate(self, *args):

@@ -45,7 +45,7 @@ class Regulariser(eqx.Module):
     """A term that `fit_pose` adds to the keypoints' in stages, its weight rising.
 
     Make your own by deriving from it: `energy` gets the parameters of one or several people, with
-    one leading axis, and is differentiated in reverse mode under jit.
+    one leading axis, in the world's axes, and is differentiated in reverse mode under jit.
 
     Attributes:
         weights: one for each stage, against a reprojection term in which a keypoint that is off by
