@@ -205,6 +205,10 @@ dependency of these benchmarks. Open3D needs the system library libgl1 on a bare
 
 def main(settings: Settings) -> None:
     """Measure, print, record, and hold against the baseline."""
+    if settings.gate and not BASELINE.exists():
+        sys.exit(
+            f"gate must have {BASELINE.name}: got none; make it with python -m benchmarks --record."
+        )
     table, metrics = against_peers(settings.repeats)
     table.print()
     second, more = end_to_end(settings.repeats)
