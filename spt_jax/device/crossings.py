@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.device.arrays import cumulative_sum, expand, indices, last_within, take
 from spt_jax.device.beam import Screen
-from spt_jax.overlap.rays.crossings import EVEN, SORTED_CORNERS
+from spt_jax.overlap.rays.scanlines import EVEN, SORTED_CORNERS
 from spt_jax.overlap.rays.levels import NARROWEST
 
 # Depths are sorted as whole numbers of this many steps, exact in float32, with a bit to spare.

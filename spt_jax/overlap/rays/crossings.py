@@ -1,33 +1,22 @@
 """Triangles x rays -> crossings, sorted by depth along each ray (paper, Algorithm 1, lines 3-11).
 
-A list of crossings sorted along every ray of a screen is a layered depth image. Triangles are
-rasterised by scanlines with half-open intervals: a row is covered by an edge when
-ceil(y0) <= row < ceil(y1), a column by a span when ceil(x_left) <= column < ceil(x_right), and an
-edge's x is computed from its two end points in an order that does not depend on the triangle. A
-span is the difference of its triangle's two active edges, and the two triangles of an edge use it
-with opposite signs, so the signs along any ray of a closed mesh sum to zero exactly: for rays
-aimed at edges and vertices, and whatever the rounding.
+A list of crossings sorted along every ray of a screen is a layered depth image. It is made in bands
+of rows, from the spans of `scanlines.py`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.rays.beam import Beam, ScreenPoints
+from spt_jax.overlap.rays.scanlines import Rows, Spans, bands, scan
 from spt_jax.overlap.rays.tiles import Tiles
 
 # Depth is quantised only for the sort; below this many bits the packed key would confuse sheets
 # that are a few micrometres apart on a body, and a wider two-part sort takes over.
 _FEWEST_DEPTH_BITS = 20
 _MOST_DEPTH_BITS = 32
-
-# (a > b) + 2 (b > c) + 4 (a > c) -> the order of corners that sorts rows a, b, c; the codes 2 + 0
-# and so on that contradict themselves cannot occur.
-SORTED_CORNERS = np.array(
-    [[0, 1, 2], [1, 0, 2], [0, 2, 1], [0, 1, 2], [0, 1, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]]
-)
-EVEN = np.array([True, False, False, True, True, True, True, False])
 
 
 @dataclass(frozen=True)
@@ -62,167 +51,172 @@ def cast(
     """
     near = points.depth.min(initial=np.inf)
     thickness = points.depth.max(initial=-np.inf) - near
-    spans = (
-        _spans(points, faces) if beam.tiles is None else _spans_within(beam.tiles, points, faces)
-    )
-
-    face_bits = max(len(faces) - 1, 1).bit_length()
-    ray_bits = beam.num_rays.bit_length()
-    depth_bits = min(_MOST_DEPTH_BITS, 62 - ray_bits - face_bits)
-    packed = depth_bits >= _FEWEST_DEPTH_BITS
-    if not packed:
-        depth_bits = min(40, 62 - ray_bits)
-    steps = float((1 << depth_bits) - 1)
-    per_unit = steps / thickness if thickness > 0 else 0.0
-
-    # One repeat, then takes: np.repeat costs three times a take.
-    of_span = np.repeat(np.arange(len(spans.width)), spans.width)
-    step = np.arange(len(of_span)) - (np.cumsum(spans.width) - spans.width)[of_span]
-    ray = beam.number(spans.row, spans.first_column)[of_span] + step
-    depth = ((spans.first_depth - near) * per_unit)[of_span]
-    depth += (spans.depth_step * per_unit)[of_span] * step
-    np.clip(depth, 0.0, steps, out=depth)
-
-    open_rays, kept = _worth_sorting(
-        beam.num_rays, ray, depth, spans.leaves.astype(np.int64)[of_span], simple_rays
-    )
-    met = len(ray)
-    if kept is not None:
-        of_span, ray, depth = of_span[kept], ray[kept], depth[kept]
-
-    # At equal depth a ray enters before it leaves; either order makes a gap of no length.
-    if packed:
-        # Packed into one integer, nothing has to be gathered after the sort.
-        fixed = (spans.leaves.astype(np.int64) << face_bits) | spans.face
-        key = fixed[of_span]
-        key += ray << (depth_bits + 1 + face_bits)
-        key += depth.astype(np.int64) << (1 + face_bits)
-        key = key.view(np.uint64)
-        key.sort()
-        key = key.view(np.int64)
-        ray = key >> (depth_bits + 1 + face_bits)
-        sign = 1 - 2 * ((key >> face_bits) & 1)
-        face = key & ((1 << face_bits) - 1)
+    sorter = _Sorter(near, thickness, len(faces), simple_rays)
+    if beam.tiles is not None:
+        spans = _within(beam.tiles, points, faces, beam.shape)
+        first = beam.tiles.number(spans.row, spans.first_column)
+        parts = [sorter.crossings(spans, first, beam.tiles.num_pixels)]
     else:
-        key = (ray << depth_bits) | depth.astype(np.int64)
-        leaves = spans.leaves[of_span]
-        order = np.lexsort((leaves, key))
-        ray = key[order] >> depth_bits
-        face = spans.face[of_span][order]
-        sign = 1 - 2 * leaves[order].astype(np.int64)
-    return Crossings(ray, face, sign, 1.0 / per_unit if per_unit else 0.0, open_rays, met)
-
-
-def _worth_sorting(num_rays: int, ray, depth, leaves, simple_rays: bool):
-    """The number of open rays, and which crossings to keep (None: all).
-
-    Decided per ray from counts and from the first and last depth of entries and exits, before the
-    sort, which costs more than all of this.
-    """
-    # A screen with far more rays than crossings is not worth arrays of its size.
-    if num_rays > 8 * len(ray) + (1 << 20):
-        used, ray = np.unique(ray, return_inverse=True)
-        num_rays = len(used)
-    entry_or_exit = 2 * ray + leaves
-    entries, exits = np.bincount(entry_or_exit, minlength=2 * num_rays).reshape(-1, 2).T
-    is_open = entries != exits
-    open_rays = int(np.count_nonzero(is_open))
-    if simple_rays:
-        return open_rays, np.flatnonzero(~is_open[ray]) if open_rays else None
-    first, last = np.full(2 * num_rays, np.inf), np.full(2 * num_rays, -np.inf)
-    np.minimum.at(first, entry_or_exit, depth)
-    np.maximum.at(last, entry_or_exit, depth)
-    (first_entry, first_exit), (last_entry, last_exit) = (
-        first.reshape(-1, 2).T,
-        last.reshape(-1, 2).T,
+        parts = []
+        for rows, face in bands(points, faces, beam.shape):
+            spans = scan(points, faces, face, rows)
+            first = (spans.row - rows.begin) * beam.shape[1] + spans.first_column
+            num_pixels = (rows.end - rows.begin) * beam.shape[1]
+            parts.append(sorter.crossings(spans, first, num_pixels, rows.begin * beam.shape[1]))
+    if len(parts) == 1:
+        return parts[0]
+    nothing = np.zeros(0, np.int64)
+    return Crossings(
+        *(
+            np.concatenate([nothing, *(getattr(part, name) for part in parts)])
+            for name in ("ray", "face", "sign")
+        ),
+        depth_quantum=max((part.depth_quantum for part in parts), default=0.0),
+        open_rays=sum(part.open_rays for part in parts),
+        met=sum(part.met for part in parts),
     )
-    # Two passes overlap if both entries lie before both exits; a ray that starts with an exit or
-    # ends with an entry meets an inverted part; of three passes and more nothing is known yet.
-    kept = (entries > 2) | ((entries == 2) & (last_entry < first_exit))
-    kept |= (first_exit < first_entry) | (last_exit < last_entry)
-    return open_rays, np.flatnonzero((kept & ~is_open)[ray])
+
+
+def _within(
+    tiles: Tiles, points: ScreenPoints, faces: Int[np.ndarray, "F 3"], shape: tuple[int, int]
+) -> Spans:
+    # All triangles that touch a tile are there, so signs cancel on every ray of the tile.
+    face = tiles.touched_by(points.row, points.column, faces)
+    spans = scan(points, faces, face, Rows(0, shape[0]))
+    part, first_column, width = tiles.clip(spans.row, spans.first_column, spans.width)
+    spans = Spans(*(column[part] for column in spans))
+    skipped = first_column - spans.first_column
+    return spans._replace(
+        first_column=first_column,
+        width=width,
+        first_depth=spans.first_depth + skipped * spans.depth_step,
+    )
 
 
 @dataclass(frozen=True)
-class _Spans:
-    """Runs of columns in which one triangle covers one row."""
+class _Sorter:
+    """Spans -> crossings, sorted.
 
-    face: Int[np.ndarray, "S"]
-    row: Int[np.ndarray, "S"]
-    first_column: Int[np.ndarray, "S"]
-    width: Int[np.ndarray, "S"]
-    leaves: np.ndarray
-    first_depth: Float[np.ndarray, "S"]
-    depth_step: Float[np.ndarray, "S"]
+    Attributes:
+        near: depth of the nearest vertex.
+        thickness: depth of the farthest one, from there.
+        num_faces: of the mesh.
+        simple_rays: whether rays without an overlap are wanted.
+    """
+
+    near: float
+    thickness: float
+    num_faces: int
+    simple_rays: bool
+
+    def crossings(
+        self, spans: Spans, first: Int[np.ndarray, "S"], num_pixels: int, first_ray: int = 0
+    ) -> Crossings:
+        """The crossings of these spans.
+
+        Args:
+            spans: of all triangles that cover any of the pixels.
+            first: number of each span's first pixel.
+            num_pixels: the numbers are below this.
+            first_ray: the ray of pixel 0.
+        """
+        face_bits = max(self.num_faces - 1, 1).bit_length()
+        pixel_bits = num_pixels.bit_length()
+        depth_bits = min(_MOST_DEPTH_BITS, 62 - pixel_bits - face_bits)
+        packed = depth_bits >= _FEWEST_DEPTH_BITS
+        if not packed:
+            depth_bits = min(40, 62 - pixel_bits)
+        steps = float((1 << depth_bits) - 1)
+        per_unit = steps / self.thickness if self.thickness > 0 else 0.0
+
+        # Everything of a crossing is linear in its number i: what its span has at i = 0, and i.
+        span = np.repeat(np.arange(len(spans.width)), spans.width)
+        number = np.arange(len(span))
+        before = np.cumsum(spans.width) - spans.width
+        # Exits are counted behind all pixels.
+        start = first - before + num_pixels * spans.leaves
+        slot = start.take(span)
+        slot += number
+        # Start and step of the depth in one complex number: one take for both.
+        line = np.empty(len(start), complex)
+        line.imag = spans.depth_step * per_unit
+        with np.errstate(invalid="ignore"):  # of empty spans
+            line.real = (spans.first_depth - self.near) * per_unit - line.imag * before
+        line = line.take(span)
+        depth = line.imag * number
+        depth += line.real
+        met = len(span)
+
+        keep, open_rays = _worth_sorting(num_pixels, slot, depth, self.simple_rays)
+        if keep is not None:
+            kept = np.flatnonzero(np.tile(keep, 2).take(slot))
+            span, slot, depth = span.take(kept), slot.take(kept), depth.take(kept)
+        np.clip(depth, 0.0, steps, out=depth)
+        quantum = 1.0 / per_unit if per_unit else 0.0
+
+        # At equal depth a ray enters before it leaves; either order makes a gap of no length.
+        if packed:
+            # Packed into one integer, nothing has to be gathered after the sort.
+            pixel_shift = depth_bits + 1 + face_bits
+            exit_bit = (1 << face_bits) - (num_pixels << pixel_shift)
+            key = (spans.leaves * exit_bit + spans.face).take(span)
+            key += slot << pixel_shift
+            key += depth.astype(np.int64) << (1 + face_bits)
+            key = key.view(np.uint64)
+            key.sort()
+            key = key.view(np.int64)
+            ray = (key >> pixel_shift) + first_ray
+            sign = 1 - 2 * ((key >> face_bits) & 1)
+            face = key & ((1 << face_bits) - 1)
+            return Crossings(ray, face, sign, quantum, open_rays, met)
+        leaves = spans.leaves.take(span)
+        pixel = slot - num_pixels * leaves
+        order = np.lexsort((leaves, (pixel << depth_bits) | depth.astype(np.int64)))
+        sign = 1 - 2 * leaves.take(order).astype(np.int64)
+        return Crossings(
+            pixel.take(order) + first_ray,
+            spans.face.take(span.take(order)),
+            sign,
+            quantum,
+            open_rays,
+            met,
+        )
 
 
-def _spans_within(tiles: Tiles, points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> _Spans:
-    # All triangles that touch a tile are there, so signs cancel on every ray of the tile.
-    face = tiles.touched_by(points.row, points.column, faces)
-    spans = _spans(points, faces[face])
-    span, first_column, width = tiles.clip(spans.row, spans.first_column, spans.width)
-    depth_step = spans.depth_step[span]
-    skipped = first_column - spans.first_column[span]
-    return _Spans(
-        face=face[spans.face[span]],
-        row=spans.row[span],
-        first_column=first_column,
-        width=width,
-        leaves=spans.leaves[span],
-        first_depth=spans.first_depth[span] + skipped * depth_step,
-        depth_step=depth_step,
-    )
+def _worth_sorting(
+    num_pixels: int, slot: Int[np.ndarray, "N"], depth: Float[np.ndarray, "N"], simple_rays: bool
+) -> tuple[Bool[np.ndarray, "P"] | None, int]:
+    """Which pixels to keep (None: all), and the number of open rays.
 
+    Decided from each pixel's number of entries and exits and, where there are at most two of
+    each, from their depths, before the sort, which costs more than all of this.
 
-def _spans(points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> _Spans:
-    first_row = np.ceil(points.row).astype(np.int64)
-    a, b, c = first_row[faces[:, 0]], first_row[faces[:, 1]], first_row[faces[:, 2]]
-    face = np.flatnonzero((a != b) | (b != c))  # the others lie between two rows
-    code = ((a > b) + 2 * (b > c) + 4 * (a > c))[face]
-    corners = faces.ravel()[3 * face + SORTED_CORNERS[code].T]  # (3, F): low, mid, high
-    even = EVEN[code]
-    x, y, z = points.column[corners], points.row[corners], points.depth[corners]
-    low, mid, high = first_row[corners]
-
-    # Three edges a triangle, each from its lower to its higher end: low-high, low-mid, mid-high.
-    # The ends' order depends on their rows alone, so both triangles of an edge compute the same x.
-    edge_x, edge_y, edge_z = (np.stack([w[0], w[0], w[1]]) for w in (x, y, z))
-    run, rise, fall = (np.stack([w[2] - w[0], w[1] - w[0], w[2] - w[1]]) for w in (x, y, z))
-    # An edge between two lattice rows covers none of them, so its slope is never used.
-    rise[1, mid == low] = rise[2, high == mid] = 1.0
-    slope_x, slope_z = (run / rise).ravel(), (fall / rise).ravel()
-    edge_x, edge_y, edge_z = edge_x.ravel(), edge_y.ravel(), edge_z.ravel()
-
-    count = high - low
-    of_face = np.repeat(np.arange(len(face)), count)
-    row = np.arange(len(of_face)) + (low - (np.cumsum(count) - count))[of_face]
-    long = of_face
-    short = of_face + len(face) * (1 + (row >= mid[of_face]))
-
-    rise_long, rise_short = row - edge_y[long], row - edge_y[short]
-    x_long = edge_x[long] + rise_long * slope_x[long]
-    x_short = edge_x[short] + rise_short * slope_x[short]
-    column_long = np.ceil(x_long).astype(np.int64)
-    signed_width = np.ceil(x_short).astype(np.int64) - column_long
-    kept = np.flatnonzero(signed_width)
-    of_face, row, long, short = of_face[kept], row[kept], long[kept], short[kept]
-    x_long, x_short, signed_width = x_long[kept], x_short[kept], signed_width[kept]
-
-    # Interpolating between the edges, never extrapolating the plane, keeps the depth inside the
-    # triangle's own range however steeply it grazes the rays.
-    z_long = edge_z[long] + rise_long[kept] * slope_z[long]
-    z_short = edge_z[short] + rise_short[kept] * slope_z[short]
-    depth_step = (z_short - z_long) / (x_short - x_long)
-    first_column = column_long[kept] + np.minimum(signed_width, 0)
-    return _Spans(
-        face=face[of_face],
-        row=row,
-        first_column=first_column,
-        width=np.abs(signed_width),
-        # An even order of (low, mid, high) is counter-clockwise, and faces the rays, when the
-        # short edges are on the right. The columns decide, not the normal: that is what makes
-        # the signs of a ray cancel exactly.
-        leaves=(signed_width > 0) != even[of_face],
-        first_depth=z_long + (first_column - x_long) * depth_step,
-        depth_step=depth_step,
-    )
+    Args:
+        num_pixels: of the band or the tiles.
+        slot: a crossing's pixel; that and num_pixels where the ray leaves.
+        depth: along the ray.
+        simple_rays: keep all rays but open ones.
+    """
+    count = np.bincount(slot, minlength=2 * num_pixels)
+    entries, exits = count[:num_pixels], count[num_pixels:]
+    is_open = entries != exits
+    open_rays = int(np.count_nonzero(is_open))
+    if simple_rays or not len(slot):
+        return (~is_open if open_rays else None), open_rays
+    # Of two depths: the one that is written last, and what the sum is more than it.
+    last = np.zeros(2 * num_pixels)
+    last[slot] = depth
+    other = np.bincount(slot, depth, 2 * num_pixels)
+    other -= last
+    np.copyto(other, last, where=count == 1)
+    first = np.minimum(other, last)
+    np.maximum(other, last, out=last)
+    first_entry, first_exit = first[:num_pixels], first[num_pixels:]
+    last_entry, last_exit = last[:num_pixels], last[num_pixels:]
+    # Two passes are apart where the second entry lies behind the first exit; a ray that starts with
+    # an exit or ends with an entry meets an inverted part; of three passes nothing is known yet.
+    simple = (first_entry <= first_exit) & (last_entry <= last_exit)
+    simple &= (entries < 2) | (first_exit <= last_entry)
+    simple &= entries < 3
+    simple |= is_open
+    return ~simple, open_rays
