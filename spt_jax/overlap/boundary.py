@@ -59,7 +59,8 @@ def boundary_gradient(
     corners = faces[overlaps.ends.ravel()]
     normal = area_normals(vertices, corners)
     # The weight does not depend on the normal's length; squares of tiny or huge ones would.
-    longest = np.abs(normal).max(axis=1, initial=0.0)
+    x, y, z = np.abs(normal).T
+    longest = np.maximum(np.maximum(x, y), z)
     normal = normal / np.where(longest > 0, longest, 1.0)[:, None]
     cosines = normal @ directions.T
     seen = np.einsum("kd,kd->k", cosines, cosines)

@@ -249,6 +249,6 @@ def usable(
         return False
     if faces.size == 0:
         return True
-    extent = np.ptp(vertices, axis=0).max()
+    extent = np.ptp(vertices.T.copy(), axis=1).max()
     far = 0 < extent < LEAST_EXTENT * rounding * np.abs(vertices).max()
     return bool(not far and faces.min() >= 0 and faces.max() < len(vertices))

@@ -53,7 +53,7 @@ def cast(
     thickness = points.depth.max(initial=-np.inf) - near
     sorter = _Sorter(near, thickness, len(faces), simple_rays)
     if beam.tiles is not None:
-        spans = _within(beam.tiles, points, faces, beam.shape)
+        spans = _within(beam.tiles, points, faces)
         first = beam.tiles.number(spans.row, spans.first_column)
         parts = [sorter.crossings(spans, first, beam.tiles.num_pixels)]
     else:
@@ -77,12 +77,10 @@ def cast(
     )
 
 
-def _within(
-    tiles: Tiles, points: ScreenPoints, faces: Int[np.ndarray, "F 3"], shape: tuple[int, int]
-) -> Spans:
+def _within(tiles: Tiles, points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Spans:
     # All triangles that touch a tile are there, so signs cancel on every ray of the tile.
     face = tiles.touched_by(points.row, points.column, faces)
-    spans = scan(points, faces, face, Rows(0, shape[0]))
+    spans = scan(points, faces, face, Rows(*tiles.rows))
     part, first_column, width = tiles.clip(spans.row, spans.first_column, spans.width)
     spans = Spans(*(column[part] for column in spans))
     skipped = first_column - spans.first_column

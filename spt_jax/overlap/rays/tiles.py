@@ -49,6 +49,20 @@ class Tiles:
         begin = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=rows))])
         return begin, first, end - 1
 
+    @cached_property
+    def _extent(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        # First and last row and first and last column of tiles that are marked.
+        rows, columns = (np.flatnonzero(self.marked.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return (0, -1), (0, -1)
+        return (int(rows[0]), int(rows[-1])), (int(columns[0]), int(columns[-1]))
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """Rows of pixels in which tiles are marked: the first, and the one behind the last."""
+        first, last = self._extent[0]
+        return first * self.size, (last + 1) * self.size
+
     def number(self, row: Int[np.ndarray, "N"], column: Int[np.ndarray, "N"]):
         """Numbers of pixels in marked tiles; along a row they rise by one from pixel to pixel."""
         tile_row, sub_row = np.divmod(row, self.size)
@@ -76,14 +90,30 @@ class Tiles:
     ) -> Int[np.ndarray, "G"]:
         """The triangles whose bounding box on the screen touches a marked tile."""
         last = np.array(self.marked.shape) - 1
+        row_tile, column_tile = _tile(row, self.size, last[0]), _tile(column, self.size, last[1])
+        # All corners on one side of all marked tiles: told from a byte a vertex, mostly.
+        (first_row, last_row), (first_column, last_column) = self._extent
+        beyond = np.zeros(len(row), np.uint8)
+        for bit, side in enumerate(
+            (
+                row_tile < first_row,
+                row_tile > last_row,
+                column_tile < first_column,
+                column_tile > last_column,
+            )
+        ):
+            beyond |= side.view(np.uint8) << np.uint8(bit)
+        a, b, c = (beyond.take(corner) for corner in faces.T)
+        near = np.flatnonzero((a & b & c) == 0)
+        faces = faces.take(near, axis=0)
         # How many marked tiles lie above and to the left of each tile's corner.
         count = np.zeros((last[0] + 2, last[1] + 2), np.int32)
         np.cumsum(np.cumsum(self.marked, axis=0, dtype=np.int32), axis=1, out=count[1:, 1:])
-        top, bottom = _bounds(row, self.size, last[0], faces)
-        left, right = _bounds(column, self.size, last[1], faces)
+        top, bottom = _bounds(row_tile, faces)
+        left, right = _bounds(column_tile, faces)
         inside = count[bottom + 1, right + 1] - count[top, right + 1]
         inside += count[top, left] - count[bottom + 1, left]
-        return np.flatnonzero(inside)
+        return near[inside > 0]
 
     def clip(
         self,
@@ -115,11 +145,17 @@ def boxes(
     faces: Int[np.ndarray, "F 3"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """First and last row and first and last column of tiles that hold pixels of each triangle."""
-    return (*_bounds(row, size, shape[0] - 1, faces), *_bounds(column, size, shape[1] - 1, faces))
+    return (
+        *_bounds(_tile(row, size, shape[0] - 1), faces),
+        *_bounds(_tile(column, size, shape[1] - 1), faces),
+    )
 
 
-def _bounds(coordinate, size, last, faces):
+def _tile(coordinate, size, last):
     # A triangle covers pixels from ceil(lowest) on; rounding down is on the safe side.
-    tile = np.minimum((coordinate * (1.0 / size)).astype(np.int64), last)
-    a, b, c = tile[faces[:, 0]], tile[faces[:, 1]], tile[faces[:, 2]]
+    return np.minimum((coordinate * (1.0 / size)).astype(np.int64), last)
+
+
+def _bounds(tile, faces):
+    a, b, c = (tile.take(corner) for corner in faces.T)
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)

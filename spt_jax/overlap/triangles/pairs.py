@@ -102,13 +102,13 @@ def edge_crossings(
             f"faces must index into vertices: got indices {faces.min()} to {faces.max()} for "
             f"{len(vertices)} vertices; indices are 0-based."
         )
-    if not np.ptp(vertices, axis=0).any():
-        return edge_crossings(vertices, faces[:0])
-    mesh = prepared(faces, len(vertices))
-    topology = mesh.topology
     # A power of two, so that nothing is rounded: products of three lengths stay in range.
     _, exponent = np.frexp(np.abs(vertices).max())
     points = np.ldexp(vertices.T.astype(np.float64, order="C"), -int(exponent))
+    if not np.ptp(points, axis=1).any():
+        return edge_crossings(vertices, faces[:0])
+    mesh = prepared(faces, len(vertices))
+    topology = mesh.topology
     touching = None if among is None else _touching(topology, among)
     layout, shape, clusters, groups = near_groups(mesh, points)
     found = list(_around_vertices(points, topology, layout, shape))

@@ -50,8 +50,9 @@ def find_sheets(
     crossings = edge_crossings(vertices, faces)
     winding = winding_by_patches(vertices, faces, directions, crossings)
     pairs = face_pairs(crossings)
-    bounding = (winding != 0)[faces]
-    hot = bounding.any(axis=1)
+    bounding = winding != 0
+    a, b, c = (bounding.take(corner) for corner in faces.T)
+    hot = a | b | c
     hot[pairs] = True
     found = np.flatnonzero(hot)
     num_regions, region = _regions(faces, winding, pairs, found)
