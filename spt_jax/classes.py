@@ -18,7 +18,6 @@ from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
 from spt_jax.overlap.measure import Rule, Sampling, measure, usable
 from spt_jax.overlap.triangles.pairs import Entangled
-from spt_jax.overlap.triangles.sheets import Map
 from spt_jax.rest_surface import RestSurface
 
 
@@ -145,10 +144,10 @@ def _labels(options, vertices, faces):
     return label
 
 
-def _labels_on_host(vertices, faces, options: _Options, map_tasks: Map):
+def _labels_on_host(vertices, faces, options: _Options):
     if not usable(vertices, faces, options.rounding) or faces.size == 0:
         return (np.zeros(len(vertices), np.int8),)
-    found = measure(vertices, faces, options.sampling, options.exclusions, map_tasks)
+    found = measure(vertices, faces, options.sampling, options.exclusions)
     try:
         return (found.labels(options.rule),)
     except Entangled:

@@ -28,18 +28,17 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
-from spt_jax.overlap.measure import Map
+from spt_jax.many_meshes import as_more_meshes, over_batch
 from spt_jax.recent import Recent
 from spt_jax.workers import Workers, usable_cores
 
 _PIECE_BYTES = 96 * 1024
 
-# function(vertices, faces, options, map) -> one array per result; NumPy alone, never raises.
-HostFunction = Callable[[np.ndarray, np.ndarray, Any, Map], tuple[np.ndarray, ...]]
+# function(vertices, faces, options) -> one array per result; NumPy alone, never raises.
+HostFunction = Callable[[np.ndarray, np.ndarray, Any], tuple[np.ndarray, ...]]
 # Shape of a result for one mesh, and its dtype's name.
 ResultSpec = tuple[tuple[int, ...], str]
 
@@ -67,16 +66,12 @@ def call_on_host(
 
     Differentiation: none; all derivatives through the result are zero.
     """
-    batch = vertices.shape[:-2]
-    bridge = _bridge(function, options, results)
-    flat = jax.lax.stop_gradient(vertices).reshape(math.prod(batch), *vertices.shape[-2:])
-    found = bridge(flat, jax.lax.stop_gradient(faces)[None])
-    return tuple(x.reshape(batch + x.shape[1:]) for x in found)
+    return over_batch(_bridge(function, options, results), vertices, faces)
 
 
 @functools.cache
 def _bridge(function: HostFunction, options: Hashable, results: tuple[ResultSpec, ...]):
-    @jax.custom_batching.custom_vmap
+    @as_more_meshes
     def bridge(vertices, faces):
         num_meshes = vertices.shape[0]
         mesh = (vertices.shape, vertices.dtype.name), (faces.shape, faces.dtype.name)
@@ -87,21 +82,6 @@ def _bridge(function: HostFunction, options: Hashable, results: tuple[ResultSpec
             jax.lax.bitcast_convert_type(word, dtype)
             for word, (_, dtype) in zip(words, results, strict=True)
         )
-
-    @bridge.def_vmap
-    def batched(axis_size, in_batched, vertices, faces):
-        vertices_batched, faces_batched = in_batched
-        if not vertices_batched:
-            vertices = jnp.broadcast_to(vertices[None], (axis_size, *vertices.shape))
-        num_meshes = vertices.shape[1]
-        if faces_batched or faces.shape[0] > 1:
-            if not faces_batched:
-                faces = faces[None]
-            faces = jnp.broadcast_to(faces, (axis_size, num_meshes, *faces.shape[-2:]))
-            faces = faces.reshape(axis_size * num_meshes, *faces.shape[-2:])
-        found = bridge(vertices.reshape(axis_size * num_meshes, *vertices.shape[2:]), faces)
-        found = tuple(x.reshape(axis_size, num_meshes, *x.shape[1:]) for x in found)
-        return found, tuple(True for _ in found)
 
     return bridge
 
@@ -152,7 +132,7 @@ def _host_entry(function, options, results, vertices_spec, faces_spec):
     def measured_anew(meshes):
         meshes = [(vertices.astype(np.float64), faces) for vertices, faces in meshes]
         if len(meshes) == 1:
-            found = [_workers.measure_one(function, options, meshes[0], parallel_map)]
+            found = [_workers.measure_one(function, options, meshes[0])]
         else:
             found = _workers.measure(function, options, meshes, _executor)
         return [
@@ -180,25 +160,6 @@ def _join(pieces, shape: tuple[int, ...], dtype: str) -> np.ndarray:
     arrays = [np.asarray(piece) for piece in pieces]
     joined = np.concatenate(arrays) if arrays else np.zeros(0, dtype)
     return joined.view(dtype).reshape(shape)
-
-
-def parallel_map(function: Callable[[Any], Any], items) -> list[Any]:
-    """Like map, on the process's own threads; NumPy releases the lock in sorts and large loops."""
-
-    # NumPy's error state belongs to a thread; overflow here is the caller's to see in the result.
-    def quietly(item):
-        with np.errstate(all="ignore"):
-            return function(item)
-
-    items = list(items)
-    if len(items) < 2 or usable_cores() < 2:
-        return [quietly(item) for item in items]
-    try:
-        futures = [_executor().submit(quietly, item) for item in items]
-    except RuntimeError:
-        # The interpreter is shutting down and takes no new work from pools.
-        return [quietly(item) for item in items]
-    return [future.result() for future in futures]
 
 
 @functools.cache

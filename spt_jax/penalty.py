@@ -24,7 +24,6 @@ from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Gradient, Rule, Sampling, Value, measure, usable
 from spt_jax.overlap.triangles.pairs import Entangled
-from spt_jax.overlap.triangles.sheets import Map
 from spt_jax.rest_surface import RestSurface
 
 
@@ -239,21 +238,21 @@ def _scalar(vertices):
     return (), vertices.dtype.name
 
 
-def _value_on_host(vertices, faces, options: _Options, map_tasks: Map):
-    return _measure(vertices, faces, options, map_tasks, with_gradient=False)[:1]
+def _value_on_host(vertices, faces, options: _Options):
+    return _measure(vertices, faces, options, with_gradient=False)[:1]
 
 
-def _value_and_gradient_on_host(vertices, faces, options: _Options, map_tasks: Map):
-    return _measure(vertices, faces, options, map_tasks, with_gradient=True)
+def _value_and_gradient_on_host(vertices, faces, options: _Options):
+    return _measure(vertices, faces, options, with_gradient=True)
 
 
-def _measure(vertices, faces, options: _Options, map_tasks: Map, *, with_gradient: bool):
+def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
     gradient = np.zeros_like(vertices)
     if not usable(vertices, faces, options.rounding):
         return np.array(np.nan), gradient
     if faces.size == 0:
         return np.zeros(()), gradient
-    found = measure(vertices, faces, options.sampling, options.exclusions, map_tasks)
+    found = measure(vertices, faces, options.sampling, options.exclusions)
     try:
         if options.value == "volume":
             value = np.array(found.volume)

@@ -8,9 +8,8 @@ from jaxtyping import Array, Float, Int, Int8
 
 from spt_jax.arguments import as_choice, as_directions, as_rays
 from spt_jax.exclusions import as_exclusions
-from spt_jax.host import parallel_map
 from spt_jax.mesh_check import one_mesh
-from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
+from spt_jax.overlap.labels import count_labels
 from spt_jax.overlap.measure import Rule, Sampling, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
@@ -50,22 +49,22 @@ class IntersectionReport:
     @property
     def num_out(self) -> int:
         """Vertices in V_out: within another part of the surface."""
-        return int(np.count_nonzero(self.labels == OUT))
+        return count_labels(self.labels).out
 
     @property
     def num_inside(self) -> int:
         """Vertices in V_in: where the surface is inside out."""
-        return int(np.count_nonzero(self.labels == INSIDE))
+        return count_labels(self.labels).inside
 
     @property
     def num_clear(self) -> int:
         """Vertices in V_0: in no self-intersection."""
-        return int(np.count_nonzero(self.labels == CLEAR))
+        return count_labels(self.labels).clear
 
     @property
     def ratio(self) -> float:
         """The part of the vertices in self-intersection (paper, Eq. 11)."""
-        return 1.0 - self.num_clear / max(len(self.labels), 1)
+        return count_labels(self.labels).ratio
 
     @property
     def intersects(self) -> bool:
@@ -179,7 +178,7 @@ def intersection_report(
     sampling = Sampling(as_rays(rays), as_directions(directions))
     exclusions = as_exclusions(face_groups, ignore_groups, folds, triangles)
     wanted = as_choice("rule", rule, Rule)
-    found = measure(points, triangles, sampling, exclusions, parallel_map)
+    found = measure(points, triangles, sampling, exclusions)
     return IntersectionReport(
         volume=found.volume,
         total_volume=found.total_volume,

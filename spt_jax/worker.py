@@ -23,7 +23,7 @@ import numpy as np
 
 from spt_jax.surface_paths import SurfacePaths, surface_paths
 
-# function(vertices, faces, options, map) -> one array per result, as `host.HostFunction`.
+# function(vertices, faces, options) -> one array per result, as `host.HostFunction`.
 Function = Callable[..., tuple[np.ndarray, ...]]
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -154,7 +154,7 @@ def serve(connection: Connection, parent: int) -> None:
             known_faces = faces
         function, options = works[number]
         with np.errstate(all="ignore"):
-            return function(vertices, known_faces, options, map)
+            return function(vertices, known_faces, options)
 
     orders = {"forget": forget, "learn": learn, "measure": measure}
     try:

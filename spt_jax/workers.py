@@ -48,9 +48,7 @@ class Workers:
         self._spent = 0.0
         self._at_work = 0
 
-    def measure_one(
-        self, function: Function, options: Hashable, mesh: Mesh, map_tasks: Callable[..., Any]
-    ) -> tuple[Any, ...]:
+    def measure_one(self, function: Function, options: Hashable, mesh: Mesh) -> tuple[Any, ...]:
         """The function of one mesh: here, or elsewhere while another thread measures here."""
         with self._lock:
             alone = self._at_work == 0
@@ -69,7 +67,7 @@ class Workers:
                     else:
                         self._release(worker)
                         return found
-            return function(*mesh, options, map_tasks)
+            return function(*mesh, options)
         finally:
             with self._lock:
                 self._at_work -= 1
@@ -120,14 +118,14 @@ class Workers:
                     except RuntimeError:  # the interpreter is leaving and takes no more work
                         self._release(worker)
             for i in taken():
-                found[i] = function(*meshes[i], options, map)
+                found[i] = function(*meshes[i], options)
         finally:
             left.clear()
             for ended in shares:
                 ended.result()
             self._spent += time.perf_counter() - begin
         for i in lost:
-            found[i] = function(*meshes[i], options, map)
+            found[i] = function(*meshes[i], options)
         return found
 
     def close(self) -> None:

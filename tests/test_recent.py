@@ -12,7 +12,7 @@ FACES = np.array([[0, 1, 2], [0, 2, 1]], np.int32)
 measured = []
 
 
-def twice(vertices, faces, options, map_tasks):
+def twice(vertices, faces, options):
     """A host function that says for what it was called."""
     measured.append((float(vertices.sum()), faces.tolist(), options))
     return np.array(vertices.sum()), 2 * vertices

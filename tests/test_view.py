@@ -128,8 +128,8 @@ def test_a_reading_is_the_report(paper, count_folds):
     reading = scene.read()
     assert reading.volume == report.volume > 0
     assert reading.crossing_pairs == report.crossing_pairs[0]
-    assert (reading.num_out, reading.num_inside) == (report.num_out, report.num_inside)
-    np.testing.assert_allclose(reading.ratio, report.ratio)
+    assert (reading.counts.out, reading.counts.inside) == (report.num_out, report.num_inside)
+    np.testing.assert_allclose(reading.counts.ratio, report.ratio)
     np.testing.assert_array_equal(reading.labels, report.labels)
 
 
@@ -194,7 +194,7 @@ def test_figures_say_what_was_measured(balls, pair_file):
     balls.name = "<b>"
     reading = balls.read()
     text = figures(reading, balls, "a & b")
-    assert f"{1e6 * reading.volume:.2f} cm³" in text and f">{reading.num_out}<" in text
+    assert f"{1e6 * reading.volume:.2f} cm³" in text and f">{reading.counts.out}<" in text
     assert "&lt;b&gt;" in text and "a &amp; b" in text and f"rgb{OUT_COLOUR}" in text
     mesh = files.open_file(pair_file)
     assert "unit³" in figures(mesh.read(), mesh, "")

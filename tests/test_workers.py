@@ -76,7 +76,7 @@ def count_answers(worker, monkeypatch):
 def check(pool, executor, meshes, options=OPTIONS):
     found = pool.measure(_value_and_gradient_on_host, options, meshes, lambda: executor)
     for mesh, (value, gradient) in zip(meshes, found, strict=True):
-        expected = _value_and_gradient_on_host(*mesh, options, map)
+        expected = _value_and_gradient_on_host(*mesh, options)
         assert value == expected[0] > 0
         np.testing.assert_array_equal(gradient, expected[1])
 
@@ -126,7 +126,7 @@ def test_errors_are_raised_here_and_leave_no_worker_busy(pool, executor):
 
 
 def test_functions_that_another_process_cannot_find_stay_here(pool, executor):
-    def double(vertices, faces, options, map_tasks):
+    def double(vertices, faces, options):
         return (2 * vertices,)
 
     assert module.packed(double, None) is None

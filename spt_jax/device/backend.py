@@ -1,7 +1,6 @@
 """The penalty and the classes on the device, for batches of any shape, one mesh after the other."""
 
 import functools
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ from spt_jax.device.patches import spread
 from spt_jax.device.settings import Xla, meshes_at_once
 from spt_jax.device.strips import Usage, no_usage
 from spt_jax.device.winding import vertex_labels
+from spt_jax.many_meshes import as_more_meshes, over_batch
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.overlap.measure import LEAST_EXTENT, Gradient, Rule, Sampling, Value
 
@@ -46,7 +46,7 @@ def penalty_on_device(
     NaN and zero where a vertex is not finite, a face out of range or a row of the screen did not
     fit into the arrays.
     """
-    return _over_batch(_penalty_of_one, task, settings, vertices, faces)
+    return over_batch(_mapped(_penalty_of_one, task, settings), vertices, faces)
 
 
 def labels_on_device(
@@ -56,7 +56,7 @@ def labels_on_device(
     task: Task,
 ) -> Int[Array, "*batch V"]:
     """The classes of every mesh's vertices; 0 where the mesh cannot be measured."""
-    return _over_batch(_labels_of_one, task, settings, vertices, faces)
+    return over_batch(_mapped(_labels_of_one, task, settings), vertices, faces)
 
 
 def usage_on_device(
@@ -66,7 +66,7 @@ def usage_on_device(
     sampling: Sampling,
 ) -> Usage:
     """What the arrays were needed for, mesh by mesh."""
-    return _over_batch(_usage_of_one, Task(sampling), settings, vertices, faces)
+    return over_batch(_mapped(_usage_of_one, Task(sampling), settings), vertices, faces)
 
 
 def _penalty_of_one(vertices, faces, settings: Xla, task: Task):
@@ -140,21 +140,11 @@ def _cleaned(vertices, faces):
     return usable, jnp.where(usable, vertices, jnp.zeros_like(vertices)), faces
 
 
-def _over_batch(function: Callable, task: Task, settings: Xla, vertices, faces):
-    batch = vertices.shape[:-2]
-    flat = jax.lax.stop_gradient(vertices).reshape(math.prod(batch), *vertices.shape[-2:])
-    found = _mapped(function, task, settings)(flat, jax.lax.stop_gradient(faces)[None])
-    return jax.tree.map(lambda x: x.reshape(batch + x.shape[1:]), found)
-
-
 @functools.cache
 def _mapped(function: Callable, task: Task, settings: Xla):
-    """The function for a list of meshes, one after the other, also under `vmap`.
+    """The function for a list of meshes, one after the other, also under `vmap`."""
 
-    Without this rule `vmap` would give every mesh arrays of its own, and all of them at once.
-    """
-
-    @jax.custom_batching.custom_vmap
+    @as_more_meshes
     def mapped(vertices, faces):
         def one(mesh):
             own = mesh if len(faces) > 1 else (*mesh, faces[0])
@@ -167,20 +157,5 @@ def _mapped(function: Callable, task: Task, settings: Xla):
         if at_once == 1:
             return jax.lax.map(one, meshes)
         return jax.lax.map(one, meshes, batch_size=at_once)
-
-    @mapped.def_vmap
-    def batched(axis_size, in_batched, vertices, faces):
-        vertices_batched, faces_batched = in_batched
-        if not vertices_batched:
-            vertices = jnp.broadcast_to(vertices[None], (axis_size, *vertices.shape))
-        num_meshes = vertices.shape[1]
-        if faces_batched or faces.shape[0] > 1:
-            if not faces_batched:
-                faces = faces[None]
-            faces = jnp.broadcast_to(faces, (axis_size, num_meshes, *faces.shape[-2:]))
-            faces = faces.reshape(axis_size * num_meshes, *faces.shape[-2:])
-        found = mapped(vertices.reshape(axis_size * num_meshes, *vertices.shape[2:]), faces)
-        found = jax.tree.map(lambda x: x.reshape(axis_size, num_meshes, *x.shape[1:]), found)
-        return found, jax.tree.map(lambda _: True, found)
 
     return mapped

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.device.arrays import cumulative_sum, expand, indices, last_within, take
 from spt_jax.device.beam import Screen
-from spt_jax.overlap.rays.scanlines import EVEN, SORTED_CORNERS
 from spt_jax.overlap.rays.levels import NARROWEST
+from spt_jax.overlap.rays.scanlines import EVEN, SORTED_CORNERS
 
 # Depths are sorted as whole numbers of this many steps, exact in float32, with a bit to spare.
 DEPTH_STEPS = 2**29 - 2**7

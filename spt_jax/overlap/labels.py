@@ -1,5 +1,7 @@
 """V_0, V_out and V_in: Algorithm 1's rule, by triangles (paper, section 3.2)."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -11,6 +13,24 @@ CLEAR, OUT, INSIDE = 0, 1, -1
 
 # A triangle of which no larger part than this lies in an overlap touches it at most.
 _SLIVER = 1e-9
+
+
+class LabelCounts(NamedTuple):
+    """How many vertices have each label."""
+
+    clear: int
+    out: int
+    inside: int
+
+    @property
+    def ratio(self) -> float:
+        """The part of the vertices in self-intersection (paper, Eq. 11)."""
+        return 1.0 - self.clear / max(sum(self), 1)
+
+
+def count_labels(label: Int[np.ndarray, "V"]) -> LabelCounts:
+    """The vertices of V_0, V_out and V_in."""
+    return LabelCounts(*(int(np.count_nonzero(label == value)) for value in (CLEAR, OUT, INSIDE)))
 
 
 def triangle_labels(

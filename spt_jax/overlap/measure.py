@@ -23,7 +23,7 @@ from spt_jax.overlap.rays.density import aim_at_sheets
 from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
 from spt_jax.overlap.triangles import closed_form
 from spt_jax.overlap.triangles.closed_form import ClosedForm
-from spt_jax.overlap.triangles.sheets import Map, Sheets, find_sheets
+from spt_jax.overlap.triangles.sheets import Sheets, find_sheets
 
 Directions = tuple[tuple[float, float, float], ...]
 Value = Literal["volume", "ratio"]
@@ -80,7 +80,6 @@ class Measurement:
     faces: Int[np.ndarray, "F 3"]
     sampling: Sampling
     exclusions: Exclusions
-    map_tasks: Map
 
     @cached_property
     def sheets(self) -> Sheets:
@@ -129,7 +128,7 @@ class Measurement:
         """Every beam of the sampling, cast through the mesh; none where none is needed."""
         if self.sampling.rays == "auto" and self._exactly.all():
             return []
-        found = list(self.map_tasks(self._along, self.sampling.directions))
+        found = [self._along(direction) for direction in self.sampling.directions]
         if self.exclusions.any:
             counted = counted_intervals(
                 self.exclusions, self.sheets, self._rims, [probe.everything for probe in found]
@@ -226,10 +225,9 @@ def measure(
     faces: Int[np.ndarray, "F 3"],
     sampling: Sampling,
     exclusions: Exclusions = NOTHING,
-    map_tasks: Map = map,
 ) -> Measurement:
     """A mesh to be measured; the work is done when something is asked of the result."""
-    return Measurement(vertices, faces, sampling, exclusions, map_tasks)
+    return Measurement(vertices, faces, sampling, exclusions)
 
 
 def usable(

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.host import parallel_map
 from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.overlap.triangles.pairs import EdgeCrossings, edge_crossings
 from spt_jax.untangle.contours import contour_forces
@@ -136,7 +135,7 @@ class _Search:
 
     def push(self, vertices: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], float]:
         """The gradient of the overlap volume, and the volume of a cube on one pixel."""
-        found = measure(vertices, self.surface.faces, self.sampling, map_tasks=parallel_map)
+        found = measure(vertices, self.surface.faces, self.sampling)
         pixel = max((beam.beam.ray_area for beam in found.beams), default=0.0)
         return found.gradient("boundary", "vertex"), pixel**1.5
 

@@ -9,7 +9,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from spt_jax.arguments import as_directions, as_rays
-from spt_jax.host import parallel_map
 from spt_jax.mesh_check import check_mesh, one_mesh
 from spt_jax.overlap.measure import Directions, Sampling, measure
 from spt_jax.overlap.triangles.pairs import edge_crossings
@@ -201,7 +200,7 @@ def _overlap(
     points = vertices.astype(np.float64)
     if not len(surface.faces):
         return MeshOverlap(0.0, 0.0, 0)
-    found = measure(points, surface.faces, Sampling("auto", directions), map_tasks=parallel_map)
+    found = measure(points, surface.faces, Sampling("auto", directions))
     return MeshOverlap(
         volume=float(found.volume),
         ratio=float(np.mean(found.labels("vertex") != 0)),

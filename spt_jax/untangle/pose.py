@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int
 from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
 from spt_jax.geometry import inflate
-from spt_jax.host import parallel_map
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.overlap.rays.beam import Rays
@@ -230,7 +229,6 @@ class _Search(eqx.Module):
             np.asarray(faces, np.int64),
             Sampling(self.measured_rays, self.directions),
             Exclusions(rest=self.rest),
-            parallel_map,
         )
         return Overlap(
             volume=jnp.asarray(found.volume, dtype),

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax.arguments import as_directions
 from spt_jax.body import BodyModel
-from spt_jax.host import parallel_map
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
-from spt_jax.overlap.labels import INSIDE, OUT
+from spt_jax.overlap.labels import LabelCounts, count_labels
 from spt_jax.overlap.measure import Rule, Sampling, measure
 
 _EXACT = Sampling("auto", as_directions(3))
@@ -46,19 +45,9 @@ class Reading:
     milliseconds: float
 
     @property
-    def num_out(self) -> int:
-        """Vertices within another part of the surface."""
-        return int(np.count_nonzero(self.labels == OUT))
-
-    @property
-    def num_inside(self) -> int:
-        """Vertices where the surface is inside out."""
-        return int(np.count_nonzero(self.labels == INSIDE))
-
-    @property
-    def ratio(self) -> float:
-        """The part of the vertices in self-intersection (paper, Eq. 11)."""
-        return float(np.mean(self.labels != 0)) if len(self.labels) else 0.0
+    def counts(self) -> LabelCounts:
+        """Vertices of V_0, V_out and V_in."""
+        return count_labels(self.labels)
 
 
 class Scene:
@@ -222,7 +211,7 @@ def _read(
     rule: Rule,
     start: float,
 ) -> Reading:
-    found = measure(points, faces, sampling, exclusions, parallel_map)
+    found = measure(points, faces, sampling, exclusions)
     volume, labels, pairs = float(found.volume), found.labels(rule), found.crossing_pairs
     milliseconds = 1e3 * (time.perf_counter() - start)
     return Reading(vertices, labels.astype(np.int8), volume, pairs, milliseconds)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.rays.beam import Beam, ScreenPoints
-from spt_jax.overlap.rays.scanlines import Rows, Spans, bands, scan
+from spt_jax.overlap.rays.scanlines import Rows, Spans, bands, paired, scan
 from spt_jax.overlap.rays.tiles import Tiles
 
 # Depth is quantised only for the sort; below this many bits the packed key would confuse sheets
@@ -135,14 +135,12 @@ class _Sorter:
         start = first - before + num_pixels * spans.leaves
         slot = start.take(span)
         slot += number
-        # Start and step of the depth in one complex number: one take for both.
-        line = np.empty(len(start), complex)
-        line.imag = spans.depth_step * per_unit
+        depth_step = spans.depth_step * per_unit
         with np.errstate(invalid="ignore"):  # of empty spans
-            line.real = (spans.first_depth - self.near) * per_unit - line.imag * before
-        line = line.take(span)
-        depth = line.imag * number
-        depth += line.real
+            start_depth = (spans.first_depth - self.near) * per_unit - depth_step * before
+        line = paired(start_depth, depth_step).take(span)
+        depth = np.imag(line) * number
+        depth += np.real(line)
         met = len(span)
 
         keep, open_rays = _worth_sorting(num_pixels, slot, depth, self.simple_rays)

@@ -5,9 +5,7 @@ part of the mesh (or inside out), or another triangle passes through it. Both ar
 every overlap, however thin, is bounded by the triangles found here.
 """
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -15,9 +13,6 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.triangles.pairs import EdgeCrossings, edge_crossings, face_pairs
 from spt_jax.overlap.triangles.patches import winding_by_patches
-
-# map(function, items); the caller may bring one that uses several threads.
-Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True)
