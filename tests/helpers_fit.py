@@ -10,7 +10,7 @@ from helpers import embedded_body, mocap
 from spt_jax import PinholeCamera, keypoint_regressor
 from spt_jax.body import BodyModel
 from spt_jax.fit.figure import Variables, make_figure
-from spt_jax.fit.objective import Objective, Weights
+from spt_jax.fit.objective import Objective, Weights, as_seen
 from spt_jax.fit.terms.priors import joint_limits, pose_prior
 from spt_jax.fit.viewer import Viewer
 
@@ -79,10 +79,12 @@ def objective(
     if start is None:
         start = Variables(prior.mean, jnp.zeros(body.num_shape), jnp.zeros(3))
     eye = globals()["camera"](dtype) if camera is None else camera
+    viewer = Viewer.of(eye)
+    start = Variables(*(jnp.asarray(given).astype(dtype) for given in start))
     trust = jnp.ones(len(keypoints)) if confidence is None else jnp.asarray(confidence)
     return Objective(
         figure=part,
-        viewer=Viewer.of(eye),
+        viewer=viewer,
         keypoints=keypoints,
         confidence=trust.astype(dtype),
         pixels=jnp.asarray(pixels, dtype),
@@ -90,7 +92,8 @@ def objective(
         prior=prior.of_joints(part.moving),
         limits=joint_limits(body.joint_names).of_joints(part.moving),
         weights=Weights(*(jnp.asarray(weight, dtype) for weight in weights)),
-        start=Variables(*(jnp.asarray(part).astype(dtype) for part in start)),
+        start=start,
+        seen=as_seen(part, viewer, start),
         fit_shape=fit_shape,
         fit_translation=fit_translation,
     )

@@ -47,7 +47,7 @@ def joints_of(case, vectors):
     body = case.figure.body
 
     def joints(vector):
-        return case.figure.points_and_joints(case.viewer.to_world(body, case.moved(vector)))[1]
+        return case.figure.posed(case.viewer.to_world(body, case.moved(vector))).joints
 
     return np.asarray(jax.jit(jax.vmap(joints))(vectors))
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax import keypoint_regressor, self_intersection_penalty
 from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.fit.figure import Variables, make_figure
 from spt_jax.fit.terms.priors import GaussianPosePrior, joint_limits, pose_prior
 from spt_jax.fit.terms.regularisers import (
@@ -49,9 +50,11 @@ def test_a_figure_has_the_keypoints_of_the_whole_body(layout, x64, rng):
     pose = body.pose_from_smpl(pose).at[:, 22:].set(0.0)
     shape, shift = rng.normal(size=(len(pose), body.num_shape)), rng.normal(size=(len(pose), 3))
     of = Variables(pose[:, part.rows], jnp.asarray(shape), jnp.asarray(shift))
-    points, joints = jax.jit(jax.vmap(part.points_and_joints))(of)
+    points, joints, rotations = jax.jit(jax.vmap(part.posed))(of)
     posed = body(pose, shape, shift)
     np.testing.assert_allclose(joints, posed.joints[:, part.rows], atol=1e-6)
+    root = matrix_from_axis_angle(pose[:, 0])
+    np.testing.assert_allclose(rotations[:, 0], root, atol=1e-12)
     expected = keypoint_regressor(body, layout).of(posed)
     # Joints that move a landmark with less than a hundredth of its weight are left out.
     np.testing.assert_allclose(points, expected, atol=1e-6 if layout == "smpl22" else 2e-3)
@@ -80,7 +83,7 @@ def test_pose_blend_shapes_follow_the_joints_that_move(x64, rng):
     pose = rng.normal(scale=0.7, size=(24, 3))
     pose[list(unseen)] = 0
     shape = rng.normal(size=10)
-    points, _ = part.points_and_joints(
+    points, *_ = part.posed(
         Variables(jnp.asarray(pose[part.rows]), jnp.asarray(shape), jnp.zeros(3))
     )
     vertices, _ = slow_body(with_parents(smpl), pose, shape, np.zeros(3))

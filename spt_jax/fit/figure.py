@@ -8,6 +8,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spt_jax.body import BodyModel
+from spt_jax.body.rotations import matrix_from_axis_angle
+from spt_jax.body.skinning import (
+    blend_shapes,
+    displacement,
+    forward_kinematics,
+    linear_blend_skinning,
+)
 from spt_jax.keypoints import KeypointRegressor
 
 # A joint that moves a landmark with less than a hundredth of its weight is not told by it.
@@ -20,6 +27,14 @@ class Variables(NamedTuple):
     pose: Float[Array, "*batch J 3"]
     shape: Float[Array, "*batch B"]
     translation: Float[Array, "*batch 3"]
+
+
+class PosedFigure(NamedTuple):
+    """A figure in a pose."""
+
+    points: Float[Array, "K 3"]  # the keypoints, in metres
+    joints: Float[Array, "M 3"]  # in metres
+    rotations: Float[Array, "M 3 3"]  # of the joints, in the world
 
 
 class Figure(eqx.Module):
@@ -42,12 +57,26 @@ class Figure(eqx.Module):
         """`moving`, to index with."""
         return np.array(self.moving)
 
-    def points_and_joints(
-        self, moved: Variables
-    ) -> tuple[Float[Array, "K 3"], Float[Array, "M 3"]]:
-        """The keypoints on the figure, and its joints, in metres."""
-        posed = self.body(moved.pose, moved.shape, moved.translation)
-        return self.regressor(posed.joints, posed.vertices), posed.joints
+    def posed(self, moved: Variables) -> PosedFigure:
+        """The figure in a pose: as `body` does it, with the rotations at hand.
+
+        Had the root's rotation been asked for besides `body`'s own, the gradient of a fit would
+        have had two such in it: a fifth of what its loop compiles.
+        """
+        body, dtype = self.body, moved.pose.dtype
+        rotations = matrix_from_axis_angle(moved.pose)
+        rest = blend_shapes(body.joint_template, body.joint_shape_basis, moved.shape, dtype)
+        world, joints = forward_kinematics(rotations, rest, body.parents)
+        vertices = blend_shapes(body.template, body.shape_basis, moved.shape, dtype)
+        if len(vertices):
+            if body.pose_basis is not None:
+                bend = rotations[1:] - jnp.eye(3, dtype=dtype)[None]
+                vertices = vertices + displacement(body.pose_basis, bend.reshape(-1))
+            weights = body.weights.astype(dtype)
+            vertices = linear_blend_skinning(vertices, weights, world, joints, rest)
+        shift = moved.translation[None]
+        joints, vertices = joints + shift, vertices + shift
+        return PosedFigure(self.regressor(joints, vertices), joints, world)
 
 
 def make_figure(body: BodyModel, regressor: KeypointRegressor) -> Figure:

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.fit.figure import Figure, Variables
 from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits
 from spt_jax.fit.viewer import Viewer
@@ -64,6 +63,7 @@ class Objective(eqx.Module):
     limits: JointLimits | None  # likewise
     weights: Weights
     start: Variables  # of the whole body, in the world
+    seen: Variables  # the same of the joints that move, in the viewer's axes
     fit_shape: bool = eqx.field(static=True)
     fit_translation: bool = eqx.field(static=True)
 
@@ -83,8 +83,7 @@ class Objective(eqx.Module):
 
     def pack(self, variables: Variables) -> Float[Array, "D"]:
         """The vector of a body in the world."""
-        seen = self.viewer.from_world(self.figure.body, variables)
-        return self.repacked(seen._replace(pose=seen.pose[self.figure.rows]))
+        return self.repacked(as_seen(self.figure, self.viewer, variables))
 
     def unpack(self, vector: Float[Array, "D"]) -> Variables:
         """The whole body in the world: what the vector holds, and what is held fixed."""
@@ -102,8 +101,8 @@ class Objective(eqx.Module):
         if self.fit_translation:
             return Variables(pose, shape, vector[end : end + 3])
         # Fixed in the world; in the viewer's axes it depends on where the root is, so on the shape.
-        at = self.viewer.from_world(self.figure.body, Variables(pose, shape, translation))
-        return at._replace(pose=pose)
+        held = Variables(pose, shape, translation)
+        return held._replace(translation=self.viewer.place_of(self.figure.body, held))
 
     def repacked(self, moved: Variables) -> Float[Array, "D"]:
         """The vector of the figure's parameters."""
@@ -116,12 +115,13 @@ class Objective(eqx.Module):
 
     def project(self, vector: Float[Array, "D"]) -> Float[Array, "K 2"]:
         """The keypoints of the body in the image, in pixels."""
-        return self.viewer.camera.project(self.figure.points_and_joints(self.moved(vector))[0])
+        return self.viewer.camera.project(self.figure.posed(self.moved(vector)).points)
 
     def residuals(self, vector: Float[Array, "D"]) -> dict[str, Array]:
         """The terms' residuals, whose squares sum to the cost; `ridge` is not among the terms."""
         moved = self.moved(vector)
-        off = (self.project(vector) - self.keypoints) / self.pixels
+        posed = self.figure.posed(moved)
+        off = (self.viewer.camera.project(posed.points) - self.keypoints) / self.pixels
         if self.robust is not None:
             square = jnp.sum(off**2, axis=-1, keepdims=True)
             off = off / jnp.sqrt(1 + square / self.robust**2)
@@ -132,10 +132,9 @@ class Objective(eqx.Module):
             found["limits"] = jnp.sqrt(self.weights.limits) * self.limits.residuals(moved.pose)
         if self.fit_shape:
             found["shape"] = jnp.sqrt(self.weights.shape) * moved.shape
-        found["upright"] = jnp.sqrt(self.weights.upright) * (
-            matrix_from_axis_angle(moved.pose[0])[:, 1] - jnp.array([0.0, 1.0, 0.0], vector.dtype)
-        )
-        ridge = jnp.sqrt(_RIDGE) * (vector - self.pack(self.start))
+        upright = jnp.array([0.0, 1.0, 0.0], vector.dtype)
+        found["upright"] = jnp.sqrt(self.weights.upright) * (posed.rotations[0, :, 1] - upright)
+        ridge = jnp.sqrt(_RIDGE) * (vector - self.repacked(self.seen))
         if self.fit_translation:
             # Not of the translation: where a search starts it is zero, the camera's own place, and
             # a body of which one point is seen would walk into the camera.
@@ -164,6 +163,12 @@ class Objective(eqx.Module):
         eye = jnp.eye(len(matrix), dtype=matrix.dtype)
         factor = jnp.linalg.cholesky(matrix + _STIFFNESS * eye)
         return jax.scipy.linalg.solve_triangular(factor, eye, trans=1, lower=True)
+
+
+def as_seen(figure: Figure, viewer: Viewer, variables: Variables) -> Variables:
+    """Of a body in the world, the joints that move, in the viewer's axes."""
+    seen = viewer.from_world(figure.body, variables)
+    return seen._replace(pose=seen.pose[figure.rows])
 
 
 def _flat(residuals: dict[str, Array]) -> list[Array]:

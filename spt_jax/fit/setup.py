@@ -12,9 +12,9 @@ from jaxtyping import Array
 
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
-from spt_jax.fit.figure import Figure, make_figure
+from spt_jax.fit.figure import Figure, Variables, make_figure
 from spt_jax.fit.inputs import Person, as_people, count_points
-from spt_jax.fit.objective import Objective, Weights
+from spt_jax.fit.objective import Objective, Weights, as_seen
 from spt_jax.fit.search.candidates import Candidates, find_candidates, refine_start
 from spt_jax.fit.search.flips import Limb, limbs_of
 from spt_jax.fit.solver import default_solver
@@ -46,7 +46,12 @@ class Search(eqx.Module):
         """The squares of one person's fit."""
         dtype, viewer, start = person.keypoints.dtype, Viewer.of(self.camera), person.start
         if self.starts:
+            # Upright is no rotation in the viewer's axes.
+            pose = start.pose[self.figure.rows].at[0].set(0.0)
+            seen = Variables(pose, start.shape, viewer.place_of(self.figure.body, start))
             start = start._replace(pose=start.pose.at[0].set(viewer.upright.astype(dtype)))
+        else:
+            seen = as_seen(self.figure, viewer, start)
         return Objective(
             figure=self.figure,
             viewer=viewer,
@@ -58,6 +63,7 @@ class Search(eqx.Module):
             limits=self.limits,
             weights=Weights(*(weight.astype(dtype) for weight in self.weights)),
             start=start,
+            seen=seen,
             fit_shape=self.fit_shape,
             fit_translation=self.fit_translation,
         )

@@ -53,15 +53,21 @@ class Viewer(eqx.Module):
         which lies at J in the resting body: R_v = Q R and t_v = Q (J + t) + q - J for a viewer at
         Q p + q.
         """
-        turn, place, root = self._as(given)
-        at = _root_joint(body, given)
+        turn, _ = self._as(given)
+        root = matrix_from_axis_angle(given.pose[0])
         pose = given.pose.at[0].set(axis_angle_from_matrix(_times(turn, root)))
-        moved = _times(turn, at + given.translation) + place - at
-        return given._replace(pose=pose, translation=moved)
+        return given._replace(pose=pose, translation=self.place_of(body, given))
+
+    def place_of(self, body: BodyModel, given: Variables) -> Float[Array, "3"]:
+        """The translation alone of a body in the viewer's axes; its rotations do not matter."""
+        turn, place = self._as(given)
+        at = _root_joint(body, given)
+        return _times(turn, at + given.translation) + place - at
 
     def to_world(self, body: BodyModel, given: Variables) -> Variables:
         """The same parameters in the world's axes. Every mode of differentiation."""
-        turn, place, root = self._as(given)
+        turn, place = self._as(given)
+        root = matrix_from_axis_angle(given.pose[0])
         at = _root_joint(body, given)
         pose = given.pose.at[0].set(axis_angle_from_matrix(_times(turn.T, root)))
         moved = _times(turn.T, at + given.translation - place) - at
@@ -69,8 +75,7 @@ class Viewer(eqx.Module):
 
     def _as(self, given: Variables):
         dtype = given.pose.dtype
-        root = matrix_from_axis_angle(given.pose[0])
-        return self.rotation.astype(dtype), self.translation.astype(dtype), root
+        return self.rotation.astype(dtype), self.translation.astype(dtype)
 
 
 def _times(left, right):

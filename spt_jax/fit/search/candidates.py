@@ -58,7 +58,7 @@ def refine_start(
     objective: Objective, solver: optx.AbstractMinimiser, max_steps: int
 ) -> Candidates:
     """The one minimum that is reached from the start that the user gave."""
-    start = objective.pack(objective.start)
+    start = objective.repacked(objective.seen)
     fitted, steps = _fit(objective, start, solver, max_steps)
     vector = jnp.where(jnp.isfinite(objective.cost(fitted)), fitted, start)
     return Candidates(vector[None], objective.cost(vector)[None], steps)
@@ -71,17 +71,15 @@ def _rounds(objective, limbs, starts, solver, max_steps):
     kinds = [0] + [1] * chunks + [2] * bool(limbs)
     first = orientation_starts(objective, starts)
 
-    def orientations(vectors, costs, chunk):
+    def orientations(best, vectors, costs, chunk):
         return first
 
-    def flipped(vectors, costs, chunk):
-        best = _distinct(vectors[:starts], costs[:starts], _TRACED_BEST)
+    def flipped(best, vectors, costs, chunk):
         every = jax.vmap(lambda x: limb_flips(objective, x, limbs))(vectors[best])
         padded = every.reshape(flips, -1)[np.arange(chunks * starts) % flips]
         return jax.lax.dynamic_slice_in_dim(padded, chunk * starts, starts)
 
-    def combined(vectors, costs, chunk):
-        best = _distinct(vectors[:starts], costs[:starts], _TRACED_BEST)
+    def combined(best, vectors, costs, chunk):
         rows = slice(starts, starts + flips)
         alone, found = vectors[best], costs[best]
         changed = (vectors[rows].reshape(_TRACED_BEST, -1, alone.shape[-1]),)
@@ -99,7 +97,8 @@ def _rounds(objective, limbs, starts, solver, max_steps):
         vectors, costs, steps = carry
         kind, chunk, place = what
         branches = [orientations, flipped, combined] if limbs else [orientations]
-        lanes = jax.lax.switch(kind, branches, vectors, costs, chunk)
+        best = _distinct(vectors[:starts], costs[:starts], _TRACED_BEST)
+        lanes = jax.lax.switch(kind, branches, best, vectors, costs, chunk)
         fitted, taken = jax.vmap(lambda x: _fit(objective, x, solver, max_steps))(lanes)
         # A solver that was thrown off course hands back where it was thrown: not a candidate.
         found = _finite(jax.vmap(objective.cost)(fitted))
@@ -134,14 +133,15 @@ def _fit(objective: Objective, vector, solver, max_steps):
 
 def _distinct(vectors, costs, count):
     """Of the best minima that are not the same, the best first; the best again where they end."""
-    best = jnp.argmin(costs)
-    chosen = [best]
-    for _ in range(count - 1):
-        near = jnp.max(jnp.abs(vectors - vectors[chosen[-1]][None]), axis=-1) < _SAME
-        costs = jnp.where(near, jnp.inf, costs)
+
+    def choose(costs, _):
         following = jnp.argmin(costs)
-        chosen.append(jnp.where(jnp.isfinite(costs[following]), following, best))
-    return jnp.stack(chosen)
+        near = jnp.max(jnp.abs(vectors - vectors[following][None]), axis=-1) < _SAME
+        left = jnp.isfinite(costs[following])
+        return jnp.where(near, jnp.inf, costs), jnp.where(left, following, jnp.argmin(first))
+
+    first = costs
+    return jax.lax.scan(choose, costs, length=count)[1]
 
 
 def _finite(costs: Float[Array, "N"]) -> Float[Array, "N"]:

@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from spt_jax.body import BodyModel
-from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from spt_jax.body.skinning import blend_shapes, forward_kinematics
+from spt_jax.body.rotations import axis_angle_from_matrix
 from spt_jax.fit.objective import Objective
 
 _LIMBS = (
@@ -48,28 +47,24 @@ def limb_flips(
     below a flipped bone keeps its orientation in the world, so that it looks the same too, up to
     the change of perspective with its new depth, which is left to the solver.
     """
-    body, moved = objective.figure.body, objective.moved(vector)
-    dtype = vector.dtype
-    rest = blend_shapes(body.joint_template, body.joint_shape_basis, moved.shape, dtype)
-    world, at = forward_kinematics(matrix_from_axis_angle(moved.pose), rest, body.parents)
-    at = at + moved.translation[None]
+    moved = objective.moved(vector)
+    _, at, world = objective.figure.posed(moved)
+    above = [objective.figure.body.parents[limb[0]] for limb in limbs]
+    chains = np.array([(top, *limb) for top, limb in zip(above, limbs, strict=True) for _ in _WAYS])
+    turns = jnp.array([way for _ in limbs for way in _WAYS])
 
-    def flipped(above, first, middle, last, upper, lower):
-        identity = jnp.eye(3, dtype=dtype)
-        thigh = jnp.where(upper, _mirroring(at[first], at[middle]), identity)
-        shin = jnp.where(lower, _mirroring(at[middle], at[last]), identity)
-        first_world, middle_world = thigh @ world[first], shin @ world[middle]
-        pose = moved.pose.at[first].set(_relative(world[above], first_world))
-        pose = pose.at[middle].set(_relative(first_world, middle_world))
-        pose = pose.at[last].set(_relative(middle_world, world[last]))
-        return objective.repacked(moved._replace(pose=pose))
+    def flipped(chain, turned):
+        # Both bones at once, and all three rotations: a fit compiles each of these functions once.
+        mirroring = jax.vmap(_mirroring)(at[chain[1:3]], at[chain[2:4]])
+        kept = jnp.broadcast_to(jnp.eye(3, dtype=vector.dtype), (2, 3, 3))
+        before = world[chain]
+        after = jnp.where(turned[:, None, None], mirroring, kept) @ before[1:3]
+        parents = jnp.concatenate([before[:1], after])
+        children = jnp.concatenate([after, before[3:]])
+        relative = axis_angle_from_matrix(jnp.swapaxes(parents, -1, -2) @ children)
+        return objective.repacked(moved._replace(pose=moved.pose.at[chain[1:]].set(relative)))
 
-    rows = [(body.parents[limb[0]], *limb, *way) for limb in limbs for way in _WAYS]
-    return jax.vmap(flipped)(*(jnp.array(column) for column in zip(*rows, strict=True)))
-
-
-def _relative(parent: Float[Array, "3 3"], child: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    return axis_angle_from_matrix(parent.T @ child)
+    return jax.vmap(flipped)(chains, turns)
 
 
 def _mirroring(start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, "3 3"]:

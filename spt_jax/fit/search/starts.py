@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from spt_jax.body.rotations import axis_angle_from_matrix
 from spt_jax.fit.figure import Variables
 from spt_jax.fit.objective import Objective
 
@@ -47,7 +47,7 @@ def orientation_starts(objective: Objective, count: int) -> Float[Array, "count 
     base = objective.start
     rest = base.pose[objective.figure.rows].at[0].set(0.0)
     origin = Variables(rest, base.shape, jnp.zeros(3, dtype))
-    points, joints = objective.figure.points_and_joints(origin)
+    points, joints, _ = objective.figure.posed(origin)
     weights = objective.confidence * jnp.asarray(_trunk_weights(objective.names), dtype)
     total = jnp.maximum(jnp.sum(weights), jnp.finfo(dtype).tiny)
     center, focal = camera.center.astype(dtype)[None], camera.focal.astype(dtype)[None]
@@ -96,8 +96,9 @@ def _as_complex(points: Float[Array, "*batch axes"]) -> Complex[Array, "*batch"]
 
 
 def _in_image(angle: Float[Array, "N"]) -> Float[Array, "N 3 3"]:
-    axis = jnp.zeros((*angle.shape, 3), angle.dtype).at[..., 2].set(angle)
-    return matrix_from_axis_angle(axis)
+    cosine, sine, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
+    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, zero + 1]
+    return jnp.stack(rows, axis=-1).reshape(-1, 3, 3)
 
 
 def _views(count: int) -> Float[np.ndarray, "N 3 3"]:
@@ -114,11 +115,10 @@ def _views(count: int) -> Float[np.ndarray, "N 3 3"]:
 
 
 def _spread_out(score: Float[Array, "N"], rotations: Float[Array, "N 3 3"], count: int) -> Array:
-    chosen = []
-    for _ in range(count):
+    def choose(score, _):
         best = jnp.argmin(score)
-        chosen.append(best)
-        cosine = (jnp.einsum("ij,nij->n", rotations[best], rotations) - 1) / 2
+        cosine = (jnp.sum(rotations[best][None] * rotations, axis=(1, 2)) - 1) / 2
         # Where all that is left is near, the least bad is taken.
-        score = jnp.where(cosine > np.cos(np.radians(_APART)), score + 10.0, score)
-    return jnp.stack(chosen)
+        return jnp.where(cosine > np.cos(np.radians(_APART)), score + 10.0, score), best
+
+    return jax.lax.scan(choose, score, length=count)[1]
