@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 
 import jax
@@ -13,6 +15,18 @@ from jaxtyping import config, install_import_hook
 # The same examples on every machine, and no database of them in the tree.
 settings.register_profile("suite", derandomize=True, database=None)
 settings.load_profile("suite")
+
+# Most of the suite's time is compiling, of programs that then run for milliseconds. With these
+# flags `test_fit_pose.py` took 150 s of a core in place of 277; neither changes what a program
+# means. They are read when JAX first compiles, and handed down to workers and to programs that
+# tests start. A jaxlib that does not know one ends the process: so another process is asked.
+_QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+if "XLA_FLAGS" not in os.environ:
+    flags = os.environ | {"XLA_FLAGS": _QUICK}
+    asked = subprocess.run(
+        [sys.executable, "-c", "import jax; jax.devices()"], env=flags, capture_output=True
+    )
+    os.environ["XLA_FLAGS"] = _QUICK if asked.returncode == 0 else ""
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
