@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 
-# Candidates handled at once: bounds the memory for any mesh. The posed body takes 17 ms with 2^14
-# of them, 12 with 2^16; with 2^18 the memory goes back to the system and is asked for anew.
-_CHUNK = 1 << 16
+# Candidates handled at once: bounds the memory for any mesh. The posed body takes 21 ms with 2^14
+# of them, 17 with 2^16 and 2^17; five bodies 148, 103 and 99.
+_CHUNK = 1 << 17
 # A coordinate of a box takes 20 bits and a guard bit, three to a word: two subtractions of words
 # do the six comparisons of two boxes, and a pair gathers four numbers instead of twelve.
 _FIELD = 21

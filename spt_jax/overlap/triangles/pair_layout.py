@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Int
 CLUSTER = 8
 _KEPT_MESHES = 4
 _KEPT_SHAPES = 4
+# Connected parts that are walked from a vertex of theirs; more are found together.
+_MOST_STARTS = 16
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Topology:
         simple: vertices whose triangles hang together by edges there, not in several fans.
         neighbours: (V, V), has an entry for each edge in both directions.
         entries: the places of each row's two directions in its data and indices.
+        starts: a vertex of each connected part, of the largest few.
         fan_start, fan: the corners (3 face + corner) at each vertex v are
             fan[fan_start[v] : fan_start[v + 1]].
     """
@@ -49,6 +52,7 @@ class Topology:
     simple: Bool[np.ndarray, "V"]
     neighbours: "scipy.sparse.csr_array"
     entries: Int[np.ndarray, "R 2"]
+    starts: Int[np.ndarray, "P"]
     fan_start: Int[np.ndarray, "V1"]
     fan: Int[np.ndarray, "F3"]
 
@@ -166,9 +170,17 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
         simple=_simple(faces, half[first[paired]], half[second[paired]], count),
         neighbours=neighbours,
         entries=entries.reshape(2, -1).T,
+        starts=_starts(neighbours),
         fan_start=np.append(0, np.cumsum(np.bincount(faces.ravel(), minlength=count))),
         fan=fan,
     )
+
+
+def _starts(neighbours) -> Int[np.ndarray, "P"]:
+    part = scipy.sparse.csgraph.connected_components(neighbours, directed=False)[1]
+    vertex = np.zeros(part.max(initial=-1) + 1, np.int64)
+    vertex[part] = np.arange(len(part))
+    return vertex[np.argsort(-np.bincount(part), kind="stable")[:_MOST_STARTS]]
 
 
 def _simple(faces, one, other, count: int) -> Bool[np.ndarray, "V"]:
