@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera
 from spt_jax.fit.figure import Variables
-from spt_jax.fit.viewer import Viewer
+from spt_jax.fit.viewer import Viewer, composed
 
 ROTATION = Rotation.from_euler("xyz", (160, 35, -20), degrees=True).as_matrix()
 
@@ -65,3 +65,35 @@ def test_to_world_differentiates_as_differences_say(x64, rng):
 
     slope = jax.jvp(place, (0.0,), (1.0,))[1]
     np.testing.assert_allclose(slope, (place(1e-6) - place(-1e-6)) / 2e-6, atol=1e-7)
+
+
+def pairs_of_rotations(rng):
+    """Any two, and where the composed angle is nothing, tiny, pi, or one of the two is nothing."""
+    first, second = rng.normal(size=(2, 60, 3))
+    unit = first[:4] / np.linalg.norm(first[:4], axis=1, keepdims=True)
+    second[0], first[1], first[2], second[2] = -first[0], 0.0, 0.0, 0.0
+    second[3:20] = -first[3:20] + rng.normal(size=(17, 3)) * 10.0 ** -np.arange(17)[:, None]
+    first[20:24], second[20:24] = 1.25 * unit, (np.pi - 1.25) * unit
+    return second, first
+
+
+def test_composed_is_one_rotation_after_the_other(dtype, rng):
+    second, first = pairs_of_rotations(rng)
+    found = jax.vmap(composed)(second.astype(dtype), first.astype(dtype))
+    expected = Rotation.from_rotvec(second) * Rotation.from_rotvec(first)
+    apart = Rotation.from_rotvec(np.array(found, np.float64)) * expected.inv()
+    assert found.dtype == dtype
+    assert apart.magnitude().max() < 8 * np.finfo(dtype).eps
+    assert np.linalg.norm(found, axis=1).max() < np.pi + 1e-6
+
+
+def test_composed_differentiates_as_differences_say(x64, rng):
+    second, first = pairs_of_rotations(rng)
+    second, first = second[:20], first[:20]  # at pi the axis jumps
+    slopes = jax.vmap(jax.jacrev(composed, argnums=1))(second, first)
+    steps = 1e-6 * np.eye(3)
+    up, down = (
+        np.stack([jax.vmap(composed)(second, first + sign * step) for step in steps], axis=-1)
+        for sign in (1, -1)
+    )
+    np.testing.assert_allclose(slopes, (up - down) / 2e-6, atol=1e-8)

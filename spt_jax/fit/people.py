@@ -16,6 +16,7 @@ from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
 from spt_jax.fit.inputs import Person
 from spt_jax.fit.pose import fit_pose
+from spt_jax.fit.programs import program
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import descend
@@ -152,7 +153,7 @@ def fit_people(
     return PeopleResult(people=best, before=before, after=after, steps=steps)
 
 
-@eqx.filter_jit
+@program
 def _descend_together(
     setup: Setup, people: Person, fits: FitResult
 ) -> tuple[FitResult, Int[Array, ""]]:

@@ -2,7 +2,6 @@
 
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
 from spt_jax.fit.inputs import Person
+from spt_jax.fit.programs import program
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.search.candidates import Candidates
 from spt_jax.fit.setup import Search, Setup, prepare_fit
@@ -169,12 +169,12 @@ def _fit_one(setup: Setup, person: Person) -> FitResult:
     return _regularise(setup, person, _searched(setup.search, person))
 
 
-@eqx.filter_jit
+@program
 def _searched(search: Search, person: Person) -> Candidates:
     return search.candidates(search.objective(person).forgiving(), _LOOKED_AT)
 
 
-@eqx.filter_jit
+@program
 def _regularise(setup: Setup, person: Person, candidates: Candidates) -> FitResult:
     objective, regulariser = setup.search.objective(person), setup.regulariser
     alone = jax.tree.map(lambda leaf: leaf[None], objective)
