@@ -8,9 +8,11 @@ from helpers import join, moved, random_rotation, sphere
 from helpers_device import SOLIDS, padded
 
 from spt_jax import self_intersection_penalty
+from spt_jax.device.pair_search import over_crossing_pairs
 from spt_jax.device.patches import spread
 from spt_jax.device.triangle_pairs import cross_each_other
 from spt_jax.overlap.rays.beam import orthogonal_directions
+from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 from spt_jax.overlap.triangles.sheets import find_sheets
 
 
@@ -52,6 +54,28 @@ def test_triangles_that_cross(rng):
     assert len(pairs) > 30
     sheets = find_sheets(vertices, faces, np.array(orthogonal_directions(3)))
     assert pairs == {tuple(sorted(pair)) for pair in sheets.pairs.tolist()}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_the_search_finds_every_pair(name, dtype):
+    """As the host's: contact is none, and pairs that share a vertex are among them."""
+    vertices, faces = padded(name, dtype)
+    # Closer together, a cluster's own triangles cross as well.
+    vertices[: len(vertices) // 3] += dtype.type(0.05)
+
+    def add(found, first, second, crosses):
+        return found.at[first, second].add(crosses.astype(jnp.int32))
+
+    count = len(faces)
+    search = jax.jit(
+        lambda v: over_crossing_pairs(
+            v, jnp.asarray(faces), add, jnp.zeros((count, count), "int32")
+        )
+    )
+    found = np.asarray(search(jnp.asarray(vertices)))
+    assert found.max(initial=0) <= 1 and not (found & found.T).any()
+    expected = face_pairs(edge_crossings(vertices.astype(np.float64), faces.astype(np.int64)))
+    assert sorted(map(sorted, np.argwhere(found).tolist())) == expected.tolist()
 
 
 def test_spread_stays_within_a_patch():

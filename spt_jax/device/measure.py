@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.device.exclusions import Rims, no_rims, which_count, with_rims
+from spt_jax.device.exclusions import find_rims, which_count
 from spt_jax.device.gradient import add_codes, boundary_gradient
 from spt_jax.device.levels import Intervals, kept_only
 from spt_jax.device.settings import Xla
@@ -69,8 +69,9 @@ def cast_beams(
     """
     counted = None
     if exclusions.any:
-        rims = _find_rims(vertices, faces, sampling, settings, exclusions)
-        may_count = rims.may_count(faces)
+        rims = find_rims(exclusions, vertices, faces)
+        overlapped = _overlapped(vertices, faces, sampling, settings)
+        may_count = rims.may_count(faces, overlapped)
         counted = functools.partial(
             which_count, exclusions, faces=faces, rims=rims, may_count=may_count
         )
@@ -95,9 +96,11 @@ def cast_beams(
     return found._replace(volume=found.volume / len(sampling.directions)), usage, usable
 
 
-def _find_rims(vertices, faces, sampling, settings, exclusions: Exclusions) -> Rims:
-    def add(rims: Rims, intervals: Intervals, ray: Ray) -> Rims:
-        return with_rims(rims, exclusions, vertices, faces, intervals)
+def _overlapped(vertices, faces, sampling, settings) -> Bool[Array, "V"]:
+    """The corners of all triangles at which rays see an overlap."""
 
-    start = no_rims(len(vertices), len(faces))
-    return over_strips(vertices, faces, sampling, settings, add, start)[0]
+    def add(codes, intervals: Intervals, ray: Ray):
+        return add_codes(codes, faces, intervals)
+
+    start = jnp.zeros(len(vertices), jnp.int32)
+    return over_strips(vertices, faces, sampling, settings, add, start)[0] > 0

@@ -7,13 +7,19 @@ from jaxtyping import Array, Bool, Float, Int
 def cross_each_other(
     vertices: Float[Array, "V 3"], first: Int[Array, "N 3"], second: Int[Array, "N 3"]
 ) -> Bool[Array, "N"]:
-    """Whether an edge of one goes through the other, pair by pair; contact is no crossing."""
+    """Whether an edge of one goes through the other, pair by pair; contact is no crossing.
+
+    Nor does an edge go through a triangle with which it shares a vertex.
+    """
     first_corners, second_corners = vertices[first], vertices[second]
-    found = _edges_through(first_corners, second_corners)
-    return found | _edges_through(second_corners, first_corners)
+    same = first[:, :, None] == second[:, None, :]
+    found = _edges_through(first_corners, second_corners, same.any(axis=2))
+    return found | _edges_through(second_corners, first_corners, same.any(axis=1))
 
 
-def _edges_through(edges: Float[Array, "N 3 3"], triangle: Float[Array, "N 3 3"]):
+def _edges_through(
+    edges: Float[Array, "N 3 3"], triangle: Float[Array, "N 3 3"], shared: Bool[Array, "N 3"]
+) -> Bool[Array, "N"]:
     found = jnp.zeros(len(edges), bool)
     a, b, c = (triangle[:, k] for k in range(3))
     normal = jnp.cross(b - a, c - a)
@@ -25,7 +31,8 @@ def _edges_through(edges: Float[Array, "N 3 3"], triangle: Float[Array, "N 3 3"]
         around = [_dot(along, jnp.cross(p - start, q - start)) for p, q in ((a, b), (b, c), (c, a))]
         inside = (around[0] > 0) & (around[1] > 0) & (around[2] > 0)
         inside |= (around[0] < 0) & (around[1] < 0) & (around[2] < 0)
-        found |= inside & (side[k] * side[(k + 1) % 3] < 0)
+        free = ~(shared[:, k] | shared[:, (k + 1) % 3])
+        found |= free & inside & (side[k] * side[(k + 1) % 3] < 0)
     return found
 
 
