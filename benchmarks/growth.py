@@ -17,7 +17,7 @@ from spt_jax.overlap.measure import Sampling, measure
 # Milliseconds of one iteration, on another machine, in the paper's Tables 2 and 3.
 PAPER_BODIES = {1: 56.76, 2: 89.80, 3: 119.25, 4: 149.58, 5: 186.76}
 PAPER_RAYS = {128: 53.84, 256: 54.96, 512: 56.76, 1024: 58.32, 2048: 59.28}
-SIZES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
+SUBDIVISIONS = range(3, 9)  # 1,024 triangles to 1,048,576
 FRAMES = ("crawl/0092", "walk/0010", "run/0010", "jump/0020", "punch/0017")
 # Metres between bodies that stand in a row: clear of each other, and so near that they are in each
 # other and some of their overlaps overlap, which takes rays.
@@ -64,7 +64,7 @@ def measure_growth(repeats: int) -> Growth:
     along = jnp.arange(len(FRAMES), dtype=jnp.float32)[:, None] * jnp.array([[1.0, 0.0, 0.0]])
     clear, near = (body(pose, translation=gap * along).vertices for gap in (_CLEAR, _NEAR))
     with progress() as bar:
-        task = bar.add_task("growth", total=len(FRAMES) + len(PAPER_RAYS) + len(SIZES))
+        task = bar.add_task("growth", total=len(FRAMES) + len(PAPER_RAYS) + len(SUBDIVISIONS))
         people = []
         for count in range(1, len(FRAMES) + 1):
             apart, together = (
@@ -81,8 +81,8 @@ def measure_growth(repeats: int) -> Growth:
             rays.append((count, cost(*one, count, 1, repeats), theirs))
             bar.advance(task)
         sizes = []
-        for size in SIZES:
-            mesh = two_balls(size)
+        for subdivisions in SUBDIVISIONS:
+            mesh = two_balls(subdivisions)
             sizes.append((len(mesh[1]), cost(*mesh, "auto", 3, repeats), peak_megabytes(*mesh)))
             bar.advance(task)
     first, auto = people[0], cost(*one, "auto", 3, repeats)
@@ -113,16 +113,22 @@ def measure_growth(repeats: int) -> Growth:
     return Growth(tables, *([row[k] for row in sizes] for k in range(3)))
 
 
-def two_balls(triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two spheres of about so many triangles in all, a third of a radius in each other."""
-    # 8 n^2 triangles a ball of n rows and 2 n columns.
-    segments = max(round(np.sqrt(triangles / 16)), 4)
-    ball = trimesh.creation.uv_sphere(radius=1.0, count=[segments, 2 * segments])
+def two_balls(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two balls of 8 * 4^subdivisions triangles each, a third of a radius in each other.
+
+    Octahedra that were subdivided and blown up: no triangle is a sliver, however many there are.
+    """
+    vertices = np.concatenate([np.eye(3), -np.eye(3)])
+    upper = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2]])
+    lower = np.array([[1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    faces = np.concatenate([upper, lower])
+    for _ in range(subdivisions):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+        vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     # Turned, so that no triangle of one is that of the other moved along an axis.
-    other = trimesh.transformations.rotation_matrix(1.0, [1.0, 2.0, 3.0])
-    second = ball.copy().apply_transform(other).apply_translation([1.67, 0.2, 0.1])
-    both = trimesh.util.concatenate(ball, second)
-    return np.asarray(both.vertices, np.float64), np.asarray(both.faces, np.int64)
+    turn = trimesh.transformations.rotation_matrix(1.0, [1.0, 2.0, 3.0])[:3, :3]
+    second = vertices @ turn.T + [1.67, 0.2, 0.1]
+    return np.concatenate([vertices, second]), np.concatenate([faces, faces + len(vertices)])
 
 
 def draw_growth(grown: Growth, path: Path) -> None:
