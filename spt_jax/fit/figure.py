@@ -102,12 +102,12 @@ def make_figure(body: BodyModel, regressor: KeypointRegressor) -> Figure:
     basis = few.pose_basis
     if basis is not None:
         columns = (9 * (moving[1:, None] - 1) + np.arange(9)).reshape(-1)
-        basis = basis[..., columns]
+        basis = jnp.asarray(np.asarray(basis)[..., columns])
     smaller = BodyModel(
         template=few.template,
         shape_basis=few.shape_basis,
-        joint_template=body.joint_template[moving],
-        joint_shape_basis=body.joint_shape_basis[moving],
+        joint_template=jnp.asarray(np.asarray(body.joint_template)[moving]),
+        joint_shape_basis=jnp.asarray(np.asarray(body.joint_shape_basis)[moving]),
         weights=jnp.asarray(share, dtype),
         faces=few.faces,
         parents=tuple(
