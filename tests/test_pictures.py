@@ -6,10 +6,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from spt_jax.show import offscreen
+from spt_jax.show import offscreen, plot_curves, render_before_after, render_mesh, render_strip
 from spt_jax.show.framing import frame, view_axes
 from spt_jax.show.offscreen import RenderingUnavailable, import_extra, offscreen_window
-from spt_jax.show.pictures import plot_curves, render_before_after, render_mesh, render_strip
 
 SIZE = (96, 128)
 

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int, UInt8
 from spt_jax.camera import PinholeCamera
 from spt_jax.keypoints.layouts import Layout
 from spt_jax.mesh_files import as_mesh_arrays
+from spt_jax.show.look import BACKGROUND, LIGHTS, MATERIAL, Picture, check_png, finished
 from spt_jax.show.offscreen import import_extra, offscreen_plotter
-from spt_jax.show.panel import _BACKGROUND, _LIGHTS, _MATERIAL, _vertex_normals
-from spt_jax.show.pictures import Picture, _check_png, _save_png
+from spt_jax.show.panel import vertex_normals
 from spt_jax.show.stick_figures import as_figures, draw_figures
 
 # Bodies in turn: light, so that keypoints stand out from them, and told apart by lightness too.
@@ -70,9 +70,18 @@ def render_overlay(
             is none, a path not ending in .png.
         OSError: the image is missing, or the file's folder is missing or cannot be written.
 
-    Example: `render_overlay("a.jpg", fit.vertices, body.faces, camera, seen, fitted=fit.keypoints)`
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import PinholeCamera, load_body
+        >>> from spt_jax.show import render_overlay
+        >>> body, upright = load_body(), jnp.zeros((52, 3)).at[0, 0].set(jnp.pi)
+        >>> camera = PinholeCamera(100.0, (40.0, 30.0), translation=(0.0, 0.0, 4.0))
+        >>> seen = camera.project(body(upright).joints[:22])
+        >>> vertices = body(upright).vertices
+        >>> render_overlay((80, 60), vertices, body.faces, camera, seen, skeleton="smpl").shape
+        (60, 80, 3)
     """
-    _check_png(path)
+    check_png(path)
     photograph = _as_photograph(image)
     bodies = _as_bodies(vertices, faces)
     if not isinstance(camera, PinholeCamera):
@@ -89,8 +98,7 @@ def render_overlay(
     picture = np.round(blended).astype(np.uint8)
     if people:
         picture = draw_figures(picture, people)
-    _save_png(picture, path)
-    return picture
+    return finished(picture, path)
 
 
 def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "height width 3"]:
@@ -127,7 +135,7 @@ def _as_photograph(image: Any) -> Float[np.ndarray, "height width 3"]:
         ):
             raise TypeError(f"image must be (width, height) in whole pixels: got {image!r}.")
         width, height = image
-        photograph = np.full((max(height, 0), max(width, 0), 3), _BACKGROUND, np.uint8)
+        photograph = np.full((max(height, 0), max(width, 0), 3), BACKGROUND, np.uint8)
     elif isinstance(image, (str, os.PathLike)):
         photograph = read_image(image)
     else:
@@ -162,19 +170,19 @@ def _draw_bodies(
     seen = [(points @ rotation.T + shift) * [1.0, -1.0, -1.0] for points, _ in bodies]
     scale = _OVERSAMPLING if width * height <= _LARGE else 1
     with offscreen_plotter(scale * width, scale * height) as plotter:
-        plotter.set_background([channel / 255 for channel in _BACKGROUND])
-        for position, intensity in _LIGHTS:
+        plotter.set_background([channel / 255 for channel in BACKGROUND])
+        for position, intensity in LIGHTS:
             light = pyvista.Light(position=position, light_type="camera light", intensity=intensity)
             plotter.add_light(light)
         for index, (points, (_, faces)) in enumerate(zip(seen, bodies, strict=True)):
             mesh = pyvista.PolyData.from_regular_faces(points, faces)
-            mesh.point_data.active_normals = _vertex_normals(points, faces)
+            mesh.point_data.active_normals = vertex_normals(points, faces)
             actor = plotter.add_mesh(
                 mesh,
                 color=_BODIES[index % len(_BODIES)],
                 reset_camera=False,
                 render=False,
-                **_MATERIAL,
+                **MATERIAL,
             )
             actor.prop.interpolation = "Phong"
         _aim(plotter, camera, width, height, -np.concatenate(seen)[:, 2])

@@ -9,23 +9,20 @@ from jaxtyping import Float, Int, UInt8
 
 from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
 from spt_jax.show.framing import Framing, marked_triangles
+from spt_jax.show.look import BACKGROUND, LIGHTS, MATERIAL
 from spt_jax.show.offscreen import import_extra, offscreen_plotter
 
-_BACKGROUND = (246, 244, 240)
-_OVERSAMPLING = 2
+OVERSAMPLING = 2
 # How much of a hidden labelled triangle shows through what lies before it: enough to be found at
 # thumbnail size, and still visibly behind.
 _SEEN_THROUGH = 0.75
-# Position in the camera's frame (right, up, towards it) and intensity: key, fill, head and rim.
-_LIGHTS = (((-0.7, 1.1, 1.3), 0.66), ((1.2, 0.3, 0.8), 0.32), ((0, 0, 1), 0.24), ((0, 1, -1), 0.2))
-_MATERIAL = {"ambient": 0.22, "diffuse": 0.92, "specular": 0.1, "specular_power": 18}
 
 
 @contextmanager
 def panel_plotter(width: int, height: int) -> Iterator[Any]:
     """Yield the plotter that draws panels of so many pixels; raises as `offscreen_plotter` does."""
-    with offscreen_plotter(_OVERSAMPLING * width, _OVERSAMPLING * height) as plotter:
-        plotter.set_background([channel / 255 for channel in _BACKGROUND])
+    with offscreen_plotter(OVERSAMPLING * width, OVERSAMPLING * height) as plotter:
+        plotter.set_background([channel / 255 for channel in BACKGROUND])
         yield plotter
 
 
@@ -48,7 +45,7 @@ def draw_panel(
     pyvista = import_extra("pyvista")
     plotter.clear_actors()
     plotter.remove_all_lights()
-    for position, intensity in _LIGHTS:
+    for position, intensity in LIGHTS:
         light = pyvista.Light(position=position, light_type="camera light", intensity=intensity)
         plotter.add_light(light)
     _aim(plotter, camera)
@@ -57,7 +54,7 @@ def draw_panel(
     out = (labels[faces] > 0).any(axis=1)
     kind = marked * np.where(out, 1, 2)
     colours = np.array([BODY_COLOUR, OUT_COLOUR, IN_COLOUR], np.uint8)[kind]
-    normals = _vertex_normals(vertices, faces)
+    normals = vertex_normals(vertices, faces)
     body = _add_surface(plotter, vertices, faces, normals, colours)
     plotter.render()  # screenshot alone would return what was drawn last
     picture = plotter.screenshot(return_img=True).astype(np.float64)
@@ -68,8 +65,8 @@ def draw_panel(
         spots = plotter.screenshot(return_img=True, transparent_background=True)
         opacity = _SEEN_THROUGH * (spots[..., 3:] / 255)
         picture += opacity * (spots[..., :3] - picture)
-    height, width = (length // _OVERSAMPLING for length in picture.shape[:2])
-    blocks = picture.reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3)
+    height, width = (length // OVERSAMPLING for length in picture.shape[:2])
+    blocks = picture.reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3)
     return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
 
@@ -86,11 +83,11 @@ def _add_surface(
     mesh.cell_data["colour"] = colours
     # render=False: a first drawing before the interpolation is set leaves the normals out for good.
     options = {"scalars": "colour", "rgb": True, "reset_camera": False, "render": False}
-    actor = plotter.add_mesh(mesh, **options, **_MATERIAL)
+    actor = plotter.add_mesh(mesh, **options, **MATERIAL)
     actor.prop.interpolation = "Phong"
     if outline:
         # Edges in the triangle's own colour widen a spot by a pixel: slivers survive scaling.
-        edges = {"style": "wireframe", "line_width": 1.5 * _OVERSAMPLING, "lighting": False}
+        edges = {"style": "wireframe", "line_width": 1.5 * OVERSAMPLING, "lighting": False}
         plotter.add_mesh(mesh, **options, **edges)
     return actor
 
@@ -106,9 +103,10 @@ def _aim(plotter: Any, camera: Framing) -> None:
     view.clipping_range = (2 * camera.depth, 6 * camera.depth)
 
 
-def _vertex_normals(
+def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
+    """Unit normals at the vertices, by the area of the triangles around them."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     weighted = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)

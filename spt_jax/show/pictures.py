@@ -1,27 +1,22 @@
 """Pictures of meshes and of their intersections, drawn without a display."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from spt_jax.mesh_files import as_mesh_arrays
-from spt_jax.output_files import atomic_write
 from spt_jax.show.framing import View, frame
-from spt_jax.show.offscreen import import_extra
+from spt_jax.show.look import GAP, Picture, check_png, check_size, finished, write_texts
 from spt_jax.show.panel import draw_panel, panel_plotter
 
-Picture = UInt8[np.ndarray, "height width 3"]
 Points = Float[Array | np.ndarray, "..."]
 Labels = Int[Array | np.ndarray, "..."]
 
-_INK = "#3b3733"
-_GAP = 6
 _TITLE_HEIGHT = 34
-_CURVES = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#3b3733")
 
 
 def render_mesh(
@@ -51,11 +46,21 @@ def render_mesh(
         title: a short line above it.
         path: a .png file to write as well, atomically.
 
+    Returns:
+        The picture, an array that a notebook shows as such.
+
     Raises:
         ImportError: the `viz` extra is not installed.
         RenderingUnavailable: this machine cannot draw off screen.
         ValueError: arrays that do not make a mesh, an unknown view, or a path not ending in .png.
         OSError: the file's folder is missing or cannot be written.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax.show import render_mesh
+        >>> ball = trimesh.creation.icosphere()
+        >>> render_mesh(ball.vertices, ball.faces, size=(64, 48)).shape
+        (48, 64, 3)
     """
     titles = None if title is None else [title]
     return render_strip([vertices], faces, [labels], titles, view=view, size=size, path=path)
@@ -89,6 +94,15 @@ def render_before_after(
     Raises:
         ImportError, RenderingUnavailable, ValueError, OSError: as `render_mesh` does, and
             ValueError for lists of different lengths.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax.show import render_before_after
+        >>> ball = trimesh.creation.icosphere()
+        >>> flat = ball.vertices * [1.0, 0.5, 1.0]
+        >>> picture = render_before_after(ball.vertices, flat, ball.faces, size=(64, 64))
+        >>> picture.shape  # two panels with a gap of 6 pixels, below their titles
+        (98, 134, 3)
     """
     columns = []
     for meshes, labels in ((before, labels_before), (after, labels_after)):
@@ -132,10 +146,17 @@ def render_strip(
     Raises:
         ImportError, RenderingUnavailable, ValueError, OSError: as `render_mesh` does, and
             ValueError where meshes, labels and titles do not match.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax.show import render_strip
+        >>> ball = trimesh.creation.icosphere()
+        >>> shrinking = [ball.vertices, 0.7 * ball.vertices, 0.4 * ball.vertices]
+        >>> render_strip(shrinking, ball.faces, size=(32, 32)).shape
+        (32, 108, 3)
     """
-    _check_png(path)
-    if min(size) < 16:
-        raise ValueError(f"size must be at least 16 by 16 pixels: got {size}")
+    check_png(path)
+    check_size(size)
     if not len(meshes):
         raise ValueError("meshes must hold at least one mesh: got none")
     if hasattr(meshes[0], "ndim"):
@@ -162,118 +183,24 @@ def render_strip(
     width, height = size
     top = _TITLE_HEIGHT if titles is not None else 0
     canvas = np.full(
-        (top + len(rows) * (height + _GAP) - _GAP, columns * (width + _GAP) - _GAP, 3),
+        (top + len(rows) * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3),
         255,
         np.uint8,
     )
     texts = [
-        (index * (width + _GAP) + width / 2, top / 2 + 1, text, "center")
+        (index * (width + GAP) + width / 2, top / 2 + 1, text, "center")
         for index, text in enumerate(titles or ())
     ]
     with panel_plotter(width, height) as plotter:
         for i, row in enumerate(rows):
-            y = top + i * (height + _GAP)
+            y = top + i * (height + GAP)
             camera = frame(
                 [p[0] for p in row], row[0][1], [p[2] for p in row], view, width / height
             )
             for j, panel in enumerate(row):
-                x = j * (width + _GAP)
+                x = j * (width + GAP)
                 canvas[y : y + height, x : x + width] = draw_panel(plotter, *panel, camera)
             if row_titles is not None:
                 texts.append((12, y + 18, row_titles[i], "left"))
-    picture = _write_texts(canvas, texts) if texts else canvas
-    _save_png(picture, path)
-    return picture
-
-
-def plot_curves(
-    series: Mapping[str, Any],
-    *,
-    xlabel: str,
-    ylabel: str,
-    log: bool = False,
-    size: tuple[int, int] = (720, 440),
-    path: str | os.PathLike[str] | None = None,
-) -> Picture:
-    """Return a plot of named curves, each labelled in its legend.
-
-    Args:
-        series: by name, either values (N,), drawn over 0, 1, 2, ..., or points (N, 2) of x and y.
-        xlabel: what the horizontal axis counts, with its unit.
-        ylabel: what the vertical axis measures, with its unit.
-        log: a logarithmic vertical axis; values that are not positive leave gaps.
-        size: (width, height) in pixels.
-        path: a .png file to write as well, atomically.
-
-    Raises:
-        ImportError: the `viz` extra is not installed.
-        ValueError: no curves, a shape other than these, or a path not ending in .png.
-        OSError: the file's folder is missing or cannot be written.
-    """
-    _check_png(path)
-    curves = {name: np.asarray(values, np.float64) for name, values in series.items()}
-    if not curves:
-        raise ValueError("series must hold at least one curve: got none")
-    for name, values in curves.items():
-        if values.ndim not in (1, 2) or (values.ndim == 2 and values.shape[1] != 2):
-            raise ValueError(
-                f"series must hold (N,) or (N, 2) arrays: got {values.shape} in {name!r}"
-            )
-    figure, canvas = _figure(*size)
-    axes = figure.add_axes((0.11, 0.14, 0.86, 0.81))
-    axes.set_facecolor("white")
-    drawn = 0
-    for index, (name, values) in enumerate(curves.items()):
-        x, y = (np.arange(len(values)), values) if values.ndim == 1 else values.T
-        y = np.where(y > 0, y, np.nan) if log else y
-        marker = "o" if len(y) < 30 else None
-        colour = _CURVES[index % len(_CURVES)]
-        axes.plot(x, y, color=colour, label=name, linewidth=2, marker=marker, markersize=4)
-        drawn += int(np.isfinite(y).sum())
-    if log and drawn:  # matplotlib warns of a logarithmic axis without a positive value
-        axes.set_yscale("log")
-    axes.set_xlabel(xlabel, color=_INK)
-    axes.set_ylabel(ylabel, color=_INK)
-    axes.tick_params(colors=_INK)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#e6e2dc", linewidth=0.8)
-    axes.legend(frameon=False, labelcolor=_INK)
-    canvas.draw()
-    picture = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-    _save_png(picture, path)
-    return picture
-
-
-def _figure(width: int, height: int) -> tuple[Any, Any]:
-    # matplotlib's objects without pyplot: no global state, and no backend that looks for a display.
-    import_extra("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width / 100, height / 100), dpi=100)
-    return figure, FigureCanvasAgg(figure)
-
-
-def _write_texts(picture: Picture, texts: list[tuple[float, float, str, str]]) -> Picture:
-    height, width = picture.shape[:2]
-    figure, canvas = _figure(width, height)
-    figure.figimage(picture)
-    for x, y, text, align in texts:
-        style = {"fontsize": 11, "color": _INK, "parse_math": False}
-        figure.text(x / width, 1 - y / height, text, ha=align, va="center", **style)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _check_png(path: str | os.PathLike[str] | None) -> None:
-    if path is not None and not os.fspath(path).lower().endswith(".png"):
-        raise ValueError(f"path must end in .png: got {os.fspath(path)!r}")
-
-
-def _save_png(picture: Picture, path: str | os.PathLike[str] | None) -> None:
-    if path is None:
-        return
-    from PIL import Image
-
-    with atomic_write(path) as temporary:
-        Image.fromarray(picture).save(temporary, format="PNG", optimize=True)
+    picture = write_texts(canvas, texts) if texts else canvas
+    return finished(picture, path)

@@ -12,9 +12,9 @@ from spt_jax.body import BodyModel
 from spt_jax.fit.terms.spheres import BodySpheres, sphere_depths
 from spt_jax.mesh_files import OUT_COLOUR
 from spt_jax.show.framing import View, frame
+from spt_jax.show.look import GAP, MATERIAL, Picture, check_png, check_size, finished
 from spt_jax.show.offscreen import import_extra
 from spt_jax.show.panel import draw_panel, panel_plotter
-from spt_jax.show.pictures import Picture, _check_png, _save_png
 
 # By part in turn: neighbours differ, and none is near the red of collisions.
 _COLOURS = np.array(
@@ -22,8 +22,6 @@ _COLOURS = np.array(
 )
 # How much of the skin lies over the spheres, and how much of a hidden collision shows through.
 _GHOST, _SEEN_THROUGH = 0.22, 0.6
-_GAP = 6
-_MATERIAL = {"ambient": 0.22, "diffuse": 0.92, "specular": 0.1, "specular_power": 18}
 
 
 def render_spheres(
@@ -56,11 +54,16 @@ def render_spheres(
             16 pixels, or a path not ending in .png.
         OSError: the file's folder is missing or cannot be written.
 
-    Example: `render_spheres(body, BodySpheres.fit(body), path="spheres.png")`
+    Example:
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit.terms.spheres import BodySpheres
+        >>> from spt_jax.show.spheres import render_spheres
+        >>> body = load_body()
+        >>> render_spheres(body, BodySpheres.fit(body), size=(60, 80)).shape
+        (80, 126, 3)
     """
-    _check_png(path)
-    if min(size) < 16:
-        raise ValueError(f"size must be at least 16 by 16 pixels: got {size}")
+    check_png(path)
+    check_size(size)
     if pose is None:
         pose = jnp.zeros((body.num_joints, 3), body.template.dtype)
     skin = np.asarray(body(pose, shape).vertices, np.float64)
@@ -97,11 +100,9 @@ def render_spheres(
             plotter.clear_actors()
             spots = _draw(plotter, _only(scene, normals, points, triangles, colliding[owner]), size)
             picture += _SEEN_THROUGH * (spots[..., 3:] / 255) * (spots[..., :3] - picture)
-    gap = np.full((size[1], _GAP, 3), 255.0)
+    gap = np.full((size[1], GAP, 3), 255.0)
     both = np.concatenate([shown, gap, picture], axis=1)
-    result = np.round(both).astype(np.uint8)
-    _save_png(result, path)
-    return result
+    return finished(np.round(both).astype(np.uint8), path)
 
 
 def _only(
@@ -120,7 +121,7 @@ def _only(
 def _draw(plotter: Any, scene: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 4"]:
     # render=False: a first drawing before the interpolation is set leaves the normals out for good.
     options = {"scalars": "colour", "rgb": True, "reset_camera": False, "render": False}
-    plotter.add_mesh(scene, **options, **_MATERIAL).prop.interpolation = "Phong"
+    plotter.add_mesh(scene, **options, **MATERIAL).prop.interpolation = "Phong"
     plotter.render()
     solid: UInt8[np.ndarray, "H W 3"] = plotter.screenshot(return_img=True)
     mask = plotter.screenshot(return_img=True, transparent_background=True)[..., 3:]

@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from spt_jax.keypoints.layouts import Layout, as_layout, edge_side, side
-from spt_jax.show.pictures import _figure
+from spt_jax.show.look import CURVES, INK, PAPER, blank_figure, drawn
 
 # Okabe and Ito's blue and orange are told apart by all kinds of colour vision.
-_SIDES = {"left": "#0072b2", "right": "#e69f00", "middle": "#3b3733"}
-_INK, _PAPER = "#3b3733", "#ffffff"
+_SIDES = {"left": CURVES[1], "right": CURVES[4], "middle": INK}
 _FAINTEST = 0.45  # of a point of confidence 0.01; one of 1 is opaque
 
 
@@ -87,7 +86,7 @@ def draw_figures(
         ImportError: the `viz` extra is not installed.
     """
     height, width = picture.shape[:2]
-    figure, canvas = _figure(width, height)
+    figure, canvas = blank_figure(width, height)
     figure.figimage(picture)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(zorder=1)  # over the picture, which is drawn last of what has one zorder
@@ -96,8 +95,7 @@ def draw_figures(
     axes.set(xlim=(0, width), ylim=(height, 0))
     for person in figures:
         _draw(axes, person, _dot_radius(person, max(width, height)))
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return drawn(canvas)
 
 
 def _dot_radius(person: StickFigure, side_length: int) -> float:
@@ -111,7 +109,7 @@ def _draw(axes: Any, person: StickFigure, radius: float) -> None:
     points, trust, fitted, layout = person
     unit = radius * 72 / axes.figure.dpi  # matplotlib counts widths in points of type
     seen = trust > 0
-    colours = [_SIDES[side(name)] for name in layout.names] if layout else [_INK] * len(points)
+    colours = [_SIDES[side(name)] for name in layout.names] if layout else [INK] * len(points)
     strength = _FAINTEST + (1 - _FAINTEST) * trust
     # For each line its two keypoints and its side.
     lines = [(*edge, edge_side(layout, edge)) for edge in layout.edges] if layout else []
@@ -119,11 +117,11 @@ def _draw(axes: Any, person: StickFigure, radius: float) -> None:
         if seen[a] and seen[b]:
             line = {"alpha": min(strength[a], strength[b]), "solid_capstyle": "round", "zorder": 2}
             x, y = points[[a, b]].T
-            axes.plot(x, y, color=_PAPER, linewidth=1.3 * unit, **line)
+            axes.plot(x, y, color=PAPER, linewidth=1.3 * unit, **line)
             axes.plot(x, y, color=_SIDES[where], linewidth=0.75 * unit, **line)
     for k in np.flatnonzero(seen):
         _circle(
-            axes, points[k], radius, 0.35 * unit, _PAPER, facecolor=colours[k], alpha=strength[k]
+            axes, points[k], radius, 0.35 * unit, PAPER, facecolor=colours[k], alpha=strength[k]
         )
     if fitted is None:
         return
@@ -133,10 +131,10 @@ def _draw(axes: Any, person: StickFigure, radius: float) -> None:
         length = np.hypot(*way)
         if seen[k] and length > size:
             x, y = np.stack([points[k], fitted[k] + way * (size / length)]).T
-            axes.plot(x, y, color=_INK, linewidth=0.35 * unit, zorder=3)
+            axes.plot(x, y, color=INK, linewidth=0.35 * unit, zorder=3)
         # A light ring under the dark one: to be seen on dark clothes too.
-        _circle(axes, fitted[k], size, 0.7 * unit, _PAPER, fill=False, alpha=0.7)
-        _circle(axes, fitted[k], size, 0.3 * unit, _INK, fill=False)
+        _circle(axes, fitted[k], size, 0.7 * unit, PAPER, fill=False, alpha=0.7)
+        _circle(axes, fitted[k], size, 0.3 * unit, INK, fill=False)
 
 
 def _circle(
