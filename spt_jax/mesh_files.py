@@ -40,6 +40,17 @@ def write_mesh(
     Raises:
         ValueError: another suffix, or arrays that do not make a mesh.
         OSError: as in `atomic_write`.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import numpy as np
+        >>> from spt_jax.mesh_files import read_mesh, write_mesh
+        >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_mesh(pathlib.Path(folder) / "tetrahedron.ply", corners, faces)
+        ...     print(read_mesh(pathlib.Path(folder) / "tetrahedron.ply")[1].tolist())
+        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
@@ -81,6 +92,17 @@ def read_mesh(
         FileNotFoundError: there is no such file.
         ValueError: an unknown suffix, an unreadable file, one without triangles (a point cloud,
             a curve, an empty mesh), or one that holds NaN.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import trimesh
+        >>> from spt_jax.mesh_files import read_mesh
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder) / "box.stl"
+        ...     _ = trimesh.creation.box().export(file)
+        ...     vertices, faces = read_mesh(file)
+        >>> vertices.shape, faces.shape  # an .stl holds three corners for each triangle
+        ((8, 3), (12, 3))
     """
     import trimesh
     from trimesh.exchange.load import mesh_formats

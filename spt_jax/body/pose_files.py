@@ -58,6 +58,17 @@ def read_poses(path: str | os.PathLike[str]) -> PoseFile:
         FileNotFoundError: there is no such file.
         ValueError: not an .npz file, pickled arrays, missing keys, wrong sizes, or NaN or infinity;
             the message names the file, the key, the shape seen and what is accepted.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import numpy as np
+        >>> from spt_jax.body.pose_files import read_poses
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder) / "amass.npz"
+        ...     np.savez(file, poses=np.zeros((5, 156)), trans=np.zeros((5, 3)), gender="neutral")
+        ...     poses = read_poses(file)
+        >>> poses.pose.shape, poses.translation.shape, poses.shape
+        ((5, 52, 3), (5, 3), None)
     """
     file = Path(path)
     if not file.exists():
@@ -105,6 +116,16 @@ def write_poses(
     Raises:
         ValueError: another suffix, or what `read_poses` would not accept.
         OSError: the folder is missing or cannot be written.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> import numpy as np
+        >>> from spt_jax.body.pose_files import read_poses, write_poses
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder) / "rest.npz"
+        ...     write_poses(file, np.zeros((22, 3)), names=["rest"])
+        ...     print(read_poses(file).names)
+        ['rest']
     """
     file = Path(path)
     if file.suffix.lower() != ".npz":

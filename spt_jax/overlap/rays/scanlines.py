@@ -167,7 +167,7 @@ class _Edges(NamedTuple):
 
 
 def paired(first: Float[np.ndarray, "*N"], second: Float[np.ndarray, "*N"]):
-    """Complex numbers of these parts: one take brings both, in half the time of a real one."""
+    """Complex numbers of these parts: one take brings both, in the time of one."""
     pair = np.empty((*first.shape, 2))
     pair[..., 0], pair[..., 1] = first, second
     return pair.view(complex)[..., 0]
