@@ -35,6 +35,7 @@ def calls() -> dict[str, Callable[[], Any]]:
     index = np.repeat(np.arange(TABLE), count)
     real, number = rng.random(TABLE), rng.random(COUNT)
     pair = real + 1j * real
+    index_32, real_32 = index.astype(np.int32), real.astype(np.float32)
     pixel = rng.integers(0, 2 * COUNT, COUNT)
     keys = rng.integers(0, 2**62, COUNT).astype(np.uint64)
     points = rng.random((COUNT, 3))
@@ -51,6 +52,8 @@ def calls() -> dict[str, Callable[[], Any]]:
         "product": lambda: number * number,
         "repeat of row numbers": lambda: np.repeat(np.arange(TABLE), count),
         "take": lambda: real.take(index),
+        "take through an index of 32 bits": lambda: real.take(index_32),
+        "take of 32 bits": lambda: real_32.take(index),
         "two takes with one index": both,
         "one take of complex numbers": lambda: pair.take(index),
         "cumulative sum": lambda: np.cumsum(number),
