@@ -118,9 +118,9 @@ def test_order_of_people_a_list_and_what_was_not_seen(people, plain):
     assert found.pose.shape == (8, 52, 3)
     assert agreeing(jax.tree.map(lambda leaf: leaf[::-1], found), plain).sum() >= 7
     # A point without confidence may be anything.
-    trust = np.ones((8, 22), np.float32)
+    trust = np.ones((3, 22), np.float32)
     trust[:, [7, 20]] = 0
-    one, two = keypoints.copy(), keypoints.copy()
+    one, two = keypoints[:3].copy(), keypoints[:3].copy()
     one[:, [7, 20]], two[:, [7, 20]] = np.nan, 1e6
     first, second = (fit(points, confidence=trust) for points in (one, two))
     np.testing.assert_array_equal(first.pose, second.pose)
@@ -158,20 +158,19 @@ def traced(people):
         return fit(points, eye, confidence=trust)
 
     call = jax.jit(jax.vmap(one, (0, 0, None)))
-    trust = np.ones((8, 22), np.float32)
-    trust[7] = 0
-    return call(jnp.asarray(people[2]), jnp.asarray(trust), camera())
+    trust = np.ones((5, 22), np.float32)
+    trust[4] = 0
+    return call(jnp.asarray(people[2][:5]), jnp.asarray(trust), camera())
 
 
 def test_under_jit_and_vmap_as_outside(plain, traced):
-    same = agreeing(traced, plain)[:7]
-    assert same.sum() >= 6
+    assert agreeing(traced, jax.tree.map(lambda leaf: leaf[:5], plain))[:4].all()
 
 
 def test_who_was_not_seen_at_all_is_said_under_jit(traced):
-    assert traced.status[7] == 3
-    assert traced.reason[7].startswith("no keypoint was seen")
-    assert not traced.converged[7]
+    assert traced.status[4] == 3
+    assert traced.reason[4].startswith("no keypoint was seen")
+    assert not traced.converged[4]
     for leaf in jax.tree.leaves(traced):
         assert np.isfinite(leaf).all()
 
