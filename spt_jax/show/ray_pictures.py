@@ -266,6 +266,7 @@ def _label(bar: Any, text: str) -> None:
     bar.set_label(text, color=INK)
     bar.ax.tick_params(colors=INK)
     bar.outline.set_visible(False)
+    bar.minorticks_off()
 
 
 def _with_unit(text: str, unit: str) -> str:
