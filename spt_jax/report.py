@@ -92,7 +92,7 @@ class IntersectionReport:
     def __str__(self) -> str:
         from rich.console import Console
 
-        console = Console(width=88, color_system=None, force_terminal=False)
+        console = Console(width=88, color_system=None, force_terminal=False, force_jupyter=False)
         with console.capture() as capture:
             console.print(self)
         return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())

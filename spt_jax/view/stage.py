@@ -9,10 +9,9 @@ from jaxtyping import Float, Int
 from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
 from spt_jax.overlap.labels import OUT
 from spt_jax.show.framing import frame, marked_triangles
+from spt_jax.show.look import BACKGROUND
 from spt_jax.view.scene import Reading, Scene
 
-# The background of the pictures that `spt_jax.show` draws.
-_BACKGROUND = (246, 244, 240)
 _OPACITY = 0.7
 # Of the body's height; fingers stand closer together than other joints.
 _HANDLE, _SMALL_HANDLE = 0.1, 0.022
@@ -42,7 +41,7 @@ class Stage:
         api = self._server.scene
         api.reset()
         api.set_up_direction("+y")
-        api.set_background_image(np.full((1, 1, 3), _BACKGROUND, np.uint8))
+        api.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8))
         self._meshes, self._handles = {}, {}
         self._look_at(reading, scene.faces)
 
