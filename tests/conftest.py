@@ -17,9 +17,10 @@ settings.register_profile("suite", derandomize=True, database=None)
 settings.load_profile("suite")
 
 # Most of the suite's time is compiling, of programs that then run for milliseconds. With these
-# flags `test_fit_pose.py` took half of a core's time; neither changes what a program means. Level
-# 0 compiles no sooner in all and rounds otherwise from program to program. The flags are read when JAX first compiles, and handed down to workers and to programs that
-# tests start. A jaxlib that does not know one ends the process: so another process is asked.
+# flags `test_fit_pose.py` took half of a core's time; neither changes what a program means. Level 0
+# is no faster in all, and two programs of one search round differently there. The flags are read
+# when JAX first compiles, and handed down to workers and to programs that tests start. A jaxlib
+# that does not know one ends the process: so another process is asked.
 _QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 if "XLA_FLAGS" not in os.environ:
     flags = os.environ | {"XLA_FLAGS": _QUICK}
