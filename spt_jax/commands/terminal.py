@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
@@ -44,7 +45,15 @@ def err_console(quiet: bool = False) -> Console:
 
 @contextmanager
 def progress_bar(total: int, quiet: bool = False) -> Iterator[State]:
-    """A bar on the standard error stream, gone when done; nothing where that is no terminal."""
+    """A bar on the standard error stream or in a notebook, gone when done; else nothing.
+
+    Where it is nothing: output that is no terminal, `quiet`, a notebook without ipywidgets.
+
+    Example:
+        >>> with progress_bar(2) as state:
+        ...     state("walk/0005", done=1)  # in a notebook also from on_step=... of a search
+        ...     state("walk/0006", done=2)
+    """
     console = err_console(quiet)
     columns = (
         SpinnerColumn(),
@@ -52,7 +61,9 @@ def progress_bar(total: int, quiet: bool = False) -> Iterator[State]:
         MofNCompleteColumn(),
         TextColumn("{task.description}", markup=False),
     )
-    disable = quiet or not console.is_terminal
+    # rich draws in notebooks by ipywidgets, and warns at every refresh where there are none.
+    in_notebook = console.is_jupyter and find_spec("ipywidgets") is not None
+    disable = quiet or not (console.is_terminal or in_notebook)
     with Progress(*columns, console=console, transient=True, disable=disable) as progress:
         task = progress.add_task("starting", total=total)
 
