@@ -55,6 +55,13 @@ class GaussianPosePrior(eqx.Module):
     Attributes:
         mean: axis-angle of every joint, in radians; the root's is zero and does not count.
         whitening: W with W^T W the inverse covariance of all joints but the root.
+
+    Example:
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit.terms.priors import pose_prior
+        >>> prior = pose_prior(load_body().joint_names)
+        >>> float(prior(prior.mean)), bool(prior(prior.mean + 0.1) > 0)
+        (0.0, True)
     """
 
     mean: Float[Array, "J 3"]
@@ -164,6 +171,14 @@ class JointLimits(eqx.Module):
 
     Attributes:
         low, high: in radians, one row a joint; infinite where there is no bound.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax.fit.terms.priors import JointLimits
+        >>> limits = JointLimits(jnp.full((2, 3), -0.5), jnp.full((2, 3), 0.5))
+        >>> pose = jnp.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])  # 0.1 rad beyond
+        >>> print(f"{limits(pose):.2f}")
+        1.00
     """
 
     low: Float[Array, "J 3"]

@@ -50,6 +50,22 @@ class Regulariser(eqx.Module):
     Attributes:
         weights: one for each stage, against a reprojection term in which a keypoint that is off by
             its expected error counts 1.
+
+    Example:
+        >>> import equinox as eqx, jax, jax.numpy as jnp
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit.figure import Variables
+        >>> from spt_jax.fit.terms.regularisers import Regulariser, as_weights
+        >>> class Still(Regulariser):
+        ...     name = "still"
+        ...     weights: jax.Array = eqx.field(converter=as_weights, default=(1.0, 10.0))
+        ...
+        ...     def energy(self, body, start, now):
+        ...         return jnp.sum((now.pose - start.pose) ** 2)
+        >>> body = load_body()  # fit_pose(body, ..., regulariser=Still()) takes it
+        >>> people = Variables(jnp.zeros((2, 52, 3)), jnp.zeros((2, 10)), jnp.zeros((2, 3)))
+        >>> float(Still().energy(body, people, people))
+        0.0
     """
 
     name: ClassVar[str]
@@ -97,6 +113,19 @@ class SelfIntersection(Regulariser):
             `optimistix.GradientDescent`. The ratio is in per cent then, and no gradient of the
             value.
         rays, directions: as in `self_intersection_penalty`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import load_body, load_mocap
+        >>> from spt_jax.fit.figure import Variables
+        >>> from spt_jax.fit.terms.regularisers import SelfIntersection
+        >>> body, mocap = load_body(), load_mocap()
+        >>> pose = body.pose_from_smpl(jnp.asarray(mocap.pose[mocap.names.index("punch/0017")]))
+        >>> person = Variables(pose[None], jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3)))
+        >>> every, far = SelfIntersection(folds="count"), SelfIntersection().prepared(body, 1)
+        >>> everything, collisions = (t.energy(body, person, person) for t in (every, far))
+        >>> bool(everything > collisions > 0)
+        True
     """
 
     name: ClassVar[str] = "spt"
@@ -151,6 +180,17 @@ class Spheres(Regulariser):
 
     Attributes:
         spheres: `BodySpheres` of the body; fitted to it if None.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit.figure import Variables
+        >>> from spt_jax.fit.terms.regularisers import Spheres
+        >>> body = load_body()
+        >>> shape, translation = jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3))
+        >>> rest = Variables(jnp.zeros((1, body.num_joints, 3)), shape, translation)
+        >>> float(Spheres().prepared(body, 1).energy(body, rest, rest))  # no sphere is in another
+        0.0
     """
 
     name: ClassVar[str] = "spheres"
@@ -181,6 +221,20 @@ class Laplacian(Regulariser):
 
     What bends the surface costs, wherever it lies: the mean squared change of the Laplacian
     coordinates since the first stage began, in the body's own frame.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit.figure import Variables
+        >>> from spt_jax.fit.terms.regularisers import Laplacian
+        >>> body = load_body()
+        >>> shape, translation = jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3))
+        >>> rest = Variables(jnp.zeros((1, body.num_joints, 3)), shape, translation)
+        >>> turned = rest._replace(pose=rest.pose.at[0, 0, 1].set(1.0))
+        >>> bent = rest._replace(pose=rest.pose.at[0, 4, 0].set(1.0))
+        >>> term = Laplacian().prepared(body, 1)
+        >>> [bool(term.energy(body, rest, now) > 0) for now in (turned, bent)]
+        [False, True]
     """
 
     name: ClassVar[str] = "laplacian"
@@ -218,6 +272,11 @@ def as_regulariser(regulariser: Any) -> Regulariser:
     Raises:
         ValueError: an unknown name.
         TypeError: neither a name nor a `Regulariser`.
+
+    Example:
+        >>> from spt_jax.fit.terms.regularisers import as_regulariser
+        >>> type(as_regulariser("spt")).__name__
+        'SelfIntersection'
     """
     if isinstance(regulariser, Regulariser):
         return regulariser
