@@ -1,36 +1,21 @@
 """Bodies and keypoints drawn over photographs: everything where the camera says it is."""
 
-import importlib.util
-
 import numpy as np
 import pytest
 import trimesh
+from helpers_show import needs_drawing
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from spt_jax.body import load_body
 from spt_jax.camera import PinholeCamera
 from spt_jax.keypoints import LAYOUTS
-from spt_jax.show import RenderingUnavailable, render_overlay
-from spt_jax.show.offscreen import offscreen_window
+from spt_jax.show import render_overlay
 from spt_jax.show.overlay import read_image
 
 SIZE = (160, 120)
 PAPER = np.array([246, 244, 240])
 BLUE, ORANGE = (0, 114, 178), (230, 159, 0)
-
-
-def _drawable():
-    if importlib.util.find_spec("pyvista") is None:
-        return False
-    try:
-        offscreen_window()
-    except RenderingUnavailable:
-        return False
-    return True
-
-
-needs_drawing = pytest.mark.skipif(not _drawable(), reason="nothing here draws off screen")
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import os
 import numpy as np
 import pytest
 import trimesh
+from helpers_show import needs_drawing
 from PIL import Image
 
 from spt_jax.show import offscreen, plot_curves, render_before_after, render_mesh, render_strip
@@ -11,17 +12,6 @@ from spt_jax.show.framing import frame, view_axes
 from spt_jax.show.offscreen import RenderingUnavailable, import_extra, offscreen_window
 
 SIZE = (96, 128)
-
-
-def drawable():
-    try:
-        offscreen_window()
-    except (ImportError, RenderingUnavailable):
-        return False
-    return True
-
-
-needs_drawing = pytest.mark.skipif(not drawable(), reason="nothing can draw off screen here")
 
 
 @pytest.fixture(scope="module")

@@ -3,25 +3,14 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers_show import needs_drawing
 from PIL import Image
 
 from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.show import look, plot_curves, plot_ray, plot_rays, ray_images, render_arrows
 from spt_jax.show.arrows import _spread_out
-from spt_jax.show.offscreen import RenderingUnavailable, offscreen_window
 from spt_jax.show.ray_pictures import _telling_ray
 from spt_jax.show.rays import cast_beam, profile
-
-
-def drawable():
-    try:
-        offscreen_window()
-    except (ImportError, RenderingUnavailable):
-        return False
-    return True
-
-
-needs_drawing = pytest.mark.skipif(not drawable(), reason="nothing can draw off screen here")
 
 
 @pytest.fixture(scope="module")
