@@ -27,6 +27,15 @@ class VertexClasses(eqx.Module):
     Attributes:
         label: 0 on V_0 (not in self-intersection), +1 on V_out (within another part of the
             surface), -1 on V_in (where the surface is inside out).
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax import classify_vertices
+        >>> box = trimesh.creation.box()
+        >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.3, 0.2]))
+        >>> classes = classify_vertices(pair.vertices, pair.faces)
+        >>> int(classes.out.sum()), int(classes.inside.sum()), f"{classes.ratio:.3f}"
+        (2, 0, '0.125')
     """
 
     label: Int8[Array, "*batch V"]

@@ -20,6 +20,20 @@ class Scene(NamedTuple):
         vertices: of all, one mesh after the other.
         faces: indices into them.
         face_groups: of each face, the number of its mesh.
+
+    Example:
+        >>> import numpy as np, trimesh
+        >>> from spt_jax import join_bodies, self_intersection_penalty, within_groups
+        >>> box = trimesh.creation.box()
+        >>> scene = join_bodies(np.stack([box.vertices, box.vertices + [0.6, 0.3, 0.2]]), box.faces)
+        >>> between = self_intersection_penalty(
+        ...     scene.vertices,
+        ...     scene.faces,
+        ...     face_groups=scene.face_groups,
+        ...     ignore_groups=within_groups(2),
+        ... )
+        >>> print(f"{between:.3f}")
+        0.224
     """
 
     vertices: Float[Array, "*batch V 3"]

@@ -36,6 +36,14 @@ class MeshCheck:
             lie inside that part.
         unreferenced_vertices: vertices of no face.
         euler_number: vertices of faces - edges + faces.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax import check_mesh
+        >>> box = trimesh.creation.box()
+        >>> found = check_mesh(box.vertices, box.faces[1:])  # a triangle is missing
+        >>> found.holes, found.boundary_edges, len(found.problems)
+        (1, 3, 1)
     """
 
     num_vertices: int

@@ -33,6 +33,15 @@ class IntersectionReport:
         rays: "auto", rays along the longer side of each screen, or (rows, columns), as asked for.
         crossings: of rays with triangles, for each beam; none where no rays were needed.
         open_rays: rays of each beam that met a hole and were left out.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax import intersection_report
+        >>> box = trimesh.creation.box()
+        >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.3, 0.2]))
+        >>> report = intersection_report(pair.vertices, pair.faces)
+        >>> report.intersects, report.num_out, report.as_dict()["vertices"]["in"]
+        (True, 2, 0)
     """
 
     volume: float

@@ -8,7 +8,15 @@ from jaxtyping import Float
 
 
 class Mocap(NamedTuple):
-    """Motion-capture frames: `names` ("crawl/0012"), `joints` and `pose`, axis-angle in radians."""
+    """Motion-capture frames: `names` ("crawl/0012"), `joints` and `pose`, axis-angle in radians.
+
+    Example:
+        >>> from spt_jax import load_mocap
+        >>> mocap = load_mocap()
+        >>> frame = mocap.names.index("crawl/0012")
+        >>> mocap.pose[frame].shape, mocap.joints[0]
+        ((22, 3), 'pelvis')
+    """
 
     names: tuple[str, ...]
     joints: tuple[str, ...]

@@ -44,6 +44,15 @@ class UntangleMeshResult:
         moved: how many vertices are not where they were.
         median_displacement, largest_displacement: of those, in the mesh's unit; 0.0 for none.
         steps: of the search, over all attempts.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax import untangle_mesh
+        >>> ball = trimesh.creation.icosphere(subdivisions=2)
+        >>> pair = trimesh.util.concatenate(ball, ball.copy().apply_translation([1.8, 0.1, 0.2]))
+        >>> found = untangle_mesh(pair.vertices, pair.faces)
+        >>> found.free, found.before.crossings > 0, found.largest_displacement < 0.2
+        (True, True, True)
     """
 
     vertices: Float[np.ndarray, "V 3"]
