@@ -72,7 +72,7 @@ def main(settings: Settings) -> None:
     lanes = jax.jit(
         jax.vmap(jax.value_and_grad(lambda v: self_intersection_penalty(v, body.faces)))
     )
-    for _ in range(3):  # until a batch has been worth another process, and that is there
+    for _ in range(8):  # until batches have been worth another process, and that is there
         host.forget()
         jax.block_until_ready(default(batch))
         time.sleep(1.0)

@@ -146,7 +146,7 @@ def end_to_end(repeats: int) -> tuple[Table, list[Metric]]:
         found = host_measurement(points, faces)
         return found.volume, found.gradient("boundary", "vertex")
 
-    for _ in range(3):  # until a batch has been worth another process, and that is there
+    for _ in range(8):  # until batches have been worth another process, and that is there
         host.forget()
         jax.block_until_ready(many(batch))
         time.sleep(1.0)

