@@ -15,10 +15,9 @@ from jaxtyping import Bool, Float, Int
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap
 from spt_jax.overlap.boundary import area_normals
-from spt_jax.overlap.rays.beam import aim, orthogonal_directions
+from spt_jax.overlap.rays.beam import aim
 from spt_jax.overlap.rays.crossings import cast
 from spt_jax.overlap.rays.levels import find_overlaps
-from spt_jax.overlap.triangles.vertex_winding import vertex_winding
 
 STEP = 1e-6
 RAYS = 512
@@ -102,7 +101,6 @@ def seconds(call) -> float:
 def main(settings: Settings) -> None:
     body, mocap = load_body(), load_mocap()
     faces = np.asarray(body.faces, np.int64)
-    directions = np.array(orthogonal_directions(3))
     pose_body = jax.jit(lambda pose: body(body.pose_from_smpl(pose)).vertices)
     frames = np.unique(np.linspace(0, len(mocap.names) - 1, settings.frames).astype(int))
     counts = np.zeros(5, int)  # vertices, classed, without a front, crossed, unequal
@@ -118,7 +116,8 @@ def main(settings: Settings) -> None:
                 return find_overlaps(beam, points, faces, crossings)
 
             def label(vertices=vertices):
-                return vertex_winding(vertices, faces, directions)
+                surface = ExactSurface(vertices, faces, float(np.finfo(np.float64).eps))
+                return ExactOverlap(surface).winding
 
             times = np.array([(seconds(label), seconds(beam)) for _ in range(5)])
             costs.append(1e3 * np.median(times, axis=0))

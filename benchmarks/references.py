@@ -80,7 +80,7 @@ def exact(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> 
         raise ValueError(
             "the mesh must be closed: got winding numbers that are not whole; see check_mesh."
         )
-    kind = np.sign(np.rint(winding))
+    kind = np.rint(winding)
 
     # Divergence theorem with x / 3: each piece bounds the levels that differ by `kind` across it.
     volume = kind @ np.einsum("ki,ki->k", corner[:, 0] - vertices.mean(axis=0), normal) / 6

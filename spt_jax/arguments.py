@@ -2,7 +2,6 @@
 
 from typing import Any, Literal, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -169,7 +168,11 @@ Backend = Literal["auto", "numpy", "xla"]
 
 
 def as_backend(backend: Any) -> Xla | None:
-    """The settings of the device path; None for NumPy's, which "auto" means on a CPU.
+    """The settings of the device path; None for the host's, which "auto" means everywhere.
+
+    On GPUs and TPUs too: the host path measures in closed form, the device path samples, and nobody
+    has run it on an accelerator yet, so it has to be asked for. What goes to the host and back is
+    little: of the embedded body 150 kB of vertices, 300 kB of faces and 150 kB of gradient.
 
     Raises:
         ValueError: an unknown name.
@@ -177,6 +180,4 @@ def as_backend(backend: Any) -> Xla | None:
     if isinstance(backend, Xla):
         return backend
     as_choice("backend", backend, Backend)
-    if backend == "auto":
-        backend = "xla" if jax.default_backend() in ("gpu", "tpu") else "numpy"
     return Xla() if backend == "xla" else None

@@ -16,8 +16,7 @@ from spt_jax.exclusions import as_exclusions
 from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
-from spt_jax.overlap.measure import Rule, Sampling, measure, usable
-from spt_jax.overlap.triangles.pairs import Entangled
+from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
 from spt_jax.rest_surface import RestSurface
 
 
@@ -154,10 +153,8 @@ def _labels(options, vertices, faces):
 
 
 def _labels_on_host(vertices, faces, options: _Options):
-    if not usable(vertices, faces, options.rounding) or faces.size == 0:
-        return (np.zeros(len(vertices), np.int8),)
-    found = measure(vertices, faces, options.sampling, options.exclusions)
     try:
-        return (found.labels(options.rule),)
-    except Entangled:
+        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+    except Unmeasurable:
         return (np.zeros(len(vertices), np.int8),)
+    return (found.labels(options.rule),)

@@ -122,8 +122,8 @@ def check_mesh(
     The winding number of section 3.2 is defined where every edge is run through as often one way
     as the other: then each ray enters as often as it leaves. An edge of four faces can fulfil
     that, so it is a warning; an edge of one or of three cannot. A closed part that is inside out
-    counts as self-intersection as a whole (phi(-1) = 1), which is a fault of the mesh unless the
-    part is the wall of a cavity.
+    counts as self-intersection as a whole (w (w - 1) / 2 is 1 at w = -1), which is a fault of the
+    mesh unless the part is the wall of a cavity.
 
     Args:
         vertices: positions of one mesh.

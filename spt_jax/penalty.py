@@ -22,8 +22,7 @@ from spt_jax.exclusions import as_exclusions
 from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.overlap.measure import Gradient, Rule, Sampling, Value, measure, usable
-from spt_jax.overlap.triangles.pairs import Entangled
+from spt_jax.overlap.measure import Gradient, Rule, Sampling, Unmeasurable, Value, measure
 from spt_jax.rest_surface import RestSurface
 
 
@@ -248,20 +247,18 @@ def _value_and_gradient_on_host(vertices, faces, options: _Options):
 
 def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
     gradient = np.zeros_like(vertices)
-    if not usable(vertices, faces, options.rounding):
+    try:
+        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+    except Unmeasurable:
         return np.array(np.nan), gradient
     if faces.size == 0:
         return np.zeros(()), gradient
-    found = measure(vertices, faces, options.sampling, options.exclusions)
-    try:
-        if options.value == "volume":
-            value = np.array(found.volume)
-        else:
-            value = np.mean(found.labels(options.rule) != 0)
-        if with_gradient:
-            gradient = found.gradient(options.gradient, options.rule)
-    except Entangled:
-        return np.array(np.nan), gradient
+    if options.value == "volume":
+        value = np.array(found.volume)
+    else:
+        value = np.mean(found.labels(options.rule) != 0)
+    if with_gradient:
+        gradient = found.gradient(options.gradient, options.rule)
     if not (np.isfinite(value) and np.isfinite(gradient).all()):  # coordinates near overflow
         return np.array(np.nan), np.zeros_like(vertices)
     return value, gradient

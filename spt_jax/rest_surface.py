@@ -1,5 +1,6 @@
 """Distances along a surface at rest: what tells a fold from a collision."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -7,11 +8,20 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.arguments import check_indices
+from spt_jax.overlap.exact import parts_in_each_other
+from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.surface_paths import MOST_PIECES, SurfacePaths, surface_paths
+
+# Distances of many faces are rounded down to so many steps of one ratio.
+_MOST_LEVELS = 32
 
 
 class RestSurface:
     """How far apart triangles lie along a mesh at rest, and which of them are near.
+
+    What is near depends on where: a pair of triangles is near if its distance is less than that of
+    either. Connected parts of the surface that lie in each other at rest, as eyeballs in a head,
+    are told, too: overlaps of theirs do not count.
 
     The distance of two triangles is the length of the shortest path along edges from a corner of
     one to a corner of the other: 0 where they share a vertex, infinite between parts that share
@@ -24,13 +34,16 @@ class RestSurface:
     to `jax.jit`.
 
     Attributes:
-        distance: triangles nearer than this are near each other, in the vertices' unit.
+        distance: triangles nearer than this are near each other, in the vertices' unit; where it
+            differs from face to face, the largest.
         num_faces: how many triangles there are, over all copies.
 
     Args:
         rest_vertices: positions of the mesh at rest, where it does not overlap itself.
         faces: indices of each triangle's corners.
-        distance: 0.3 m tells arms from the trunk and keeps armpits, elbows and fingers together.
+        distance: one number, or one for each face. 0.3 m tells arms from the trunk and keeps
+            armpits and elbows together; fingers want 2 to 4 cm (`body.rest_surface` has both), and
+            `local_distances(vertices, faces)` finds some for any mesh.
 
     Raises:
         TypeError: an array has the wrong kind of dtype or is traced; distance is no number.
@@ -54,10 +67,13 @@ class RestSurface:
     num_faces: int
     _paths: SurfacePaths
     _copies: int
+    _levels: tuple[float, ...]
+    _level: bytes
 
-    def __init__(self, rest_vertices: Any, faces: Any, distance: float = 0.3):
-        reach = _as_distance(distance)
-        paths = surface_paths(*_as_surface(rest_vertices, faces))
+    def __init__(self, rest_vertices: Any, faces: Any, distance: Any = 0.3):
+        vertices, corners = _as_surface(rest_vertices, faces)
+        reach = _as_distances(distance, len(corners))
+        paths = surface_paths(vertices, corners)
         if paths.pieces > MOST_PIECES:
             raise ValueError(
                 f"the rest mesh must have at most {MOST_PIECES} pieces: got {paths.pieces}; merge "
@@ -65,9 +81,12 @@ class RestSurface:
             )
         self._set(paths, reach, copies=1)
 
-    def _set(self, paths: SurfacePaths, distance: float, copies: int) -> None:
+    def _set(
+        self, paths: SurfacePaths, reach: tuple[tuple[float, ...], bytes], copies: int
+    ) -> None:
         # Set once, through object: what hashes must not change.
-        values = {"_paths": paths, "distance": distance, "_copies": copies}
+        values: dict[str, Any] = {"_paths": paths, "distance": max(reach[0]), "_copies": copies}
+        values["_levels"], values["_level"] = reach
         values["num_faces"] = copies * len(paths.faces)
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -75,8 +94,8 @@ class RestSurface:
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"{name} cannot be set: a RestSurface does not change; make another.")
 
-    def _key(self) -> tuple[Any, float, int]:
-        return self._paths.content, self.distance, self._copies
+    def _key(self) -> tuple[Any, ...]:
+        return self._paths.content, self._levels, self._level, self._copies
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RestSurface) and self._key() == other._key()
@@ -86,17 +105,30 @@ class RestSurface:
 
     def __repr__(self) -> str:
         copies = f", copies={self._copies}" if self._copies > 1 else ""
-        return f"RestSurface({self.num_faces} faces, distance={self.distance}{copies})"
+        low, high = min(self._levels), max(self._levels)
+        distance = f"{high:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+        return f"RestSurface({self.num_faces} faces, distance={distance}{copies})"
 
-    def within(self, distance: float) -> "RestSurface":
-        """The same surface with another `distance`; the table is shared.
+    @property
+    def distances(self) -> Float[np.ndarray, "F"]:
+        """The distance of each face, over all copies."""
+        return np.tile(np.array(self._levels)[self._level_of_faces], self._copies)
+
+    @property
+    def _level_of_faces(self):
+        if not self._level:
+            return np.zeros(len(self._paths.faces), np.uint8)
+        return np.frombuffer(self._level, np.uint8)
+
+    def within(self, distance: Any) -> "RestSurface":
+        """The same surface with another `distance`, one or one a face; the table is shared.
 
         Example:
             >>> from spt_jax.body import load_body
-            >>> load_body().rest_surface.within(0.2).distance
-            0.2
+            >>> load_body().rest_surface.within(0.2)
+            RestSurface(24540 faces, distance=0.2)
         """
-        return self._derived(_as_distance(distance), self._copies)
+        return self._derived(_as_distances(distance, len(self._paths.faces)), self._copies)
 
     def copies(self, count: int) -> "RestSurface":
         """The rest surface of `count` such meshes whose faces follow each other, as in a scene.
@@ -113,7 +145,7 @@ class RestSurface:
         """
         if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
             raise ValueError(f"count must be a positive whole number: got {count!r}.")
-        return self._derived(self.distance, self._copies * int(count))
+        return self._derived((self._levels, self._level), self._copies * int(count))
 
     def has_faces(self, faces: Any) -> bool:
         """Whether these are the faces of the rest mesh, or of its copies one after the other."""
@@ -124,9 +156,9 @@ class RestSurface:
         step = len(self._paths.content.vertices)
         return all(np.array_equal(copy - k * step, own) for k, copy in enumerate(copies))
 
-    def _derived(self, distance: float, copies: int) -> "RestSurface":
+    def _derived(self, reach, copies: int) -> "RestSurface":
         other = object.__new__(RestSurface)
-        other._set(self._paths, distance, copies)
+        other._set(self._paths, reach, copies)
         return other
 
     def between_faces(
@@ -147,7 +179,7 @@ class RestSurface:
     def near(
         self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"], exact: bool = False
     ) -> Bool[np.ndarray, "N"]:
-        """Whether triangles lie nearer than `distance` to each other.
+        """Whether triangles lie nearer to each other than the smaller of their distances.
 
         Args:
             f, g: the pairs, as indices of faces.
@@ -157,16 +189,43 @@ class RestSurface:
                 embedded body take about 9 ms at first and 0.7 ms again, and of 180,000 none is
                 wrong; by `between_faces`, 1.3 % of them would be.
         """
+        if len(self._levels) == 1:
+            return self._nearer(f, g, self.distance, exact)
+        level = self._level_of_faces
+        of_pair = np.minimum(*(level[x % len(level)] for x in (f, g)))
+        near = np.zeros(len(f), bool)
+        for number in np.unique(of_pair):
+            at = np.flatnonzero(of_pair == number)
+            near[at] = self._nearer(f[at], g[at], self._levels[number], exact)
+        return near
+
+    def _nearer(self, f, g, distance: float, exact: bool):
         if not exact:
-            return self.between_faces(f, g) < self.distance
+            return self.between_faces(f, g) < distance
         lower, upper = self._bounds(f, g)
         slack = self._paths.slack
-        near = upper < self.distance - slack
-        undecided = np.flatnonzero(~near & (lower < self.distance + slack))
+        near = upper < distance - slack
+        undecided = np.flatnonzero(~near & (lower < distance + slack))
         if len(undecided):
             f, g = (x[undecided] % len(self._paths.faces) for x in (f, g))
-            near[undecided] = self._paths.near(f, g, self.distance)
+            near[undecided] = self._paths.near(f, g, distance)
         return near
+
+    def overlap_at_rest(
+        self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether the connected parts of two triangles lie in each other at rest.
+
+        They are meant to: eyeballs in a head, teeth in a jaw. Parts of different copies do not.
+        """
+        part, pairs = _rest_parts(self._paths.content)
+        if not len(pairs):
+            return np.zeros(np.broadcast_shapes(np.shape(f), np.shape(g)), bool)
+        count = len(part)
+        first, second = part[f % count], part[g % count]
+        size = int(part.max()) + 1
+        low, high = np.minimum(first, second), np.maximum(first, second)
+        return (f // count == g // count) & np.isin(low * size + high, pairs @ [size, 1])
 
     def _bounds(self, f, g):
         if self._copies == 1:
@@ -176,6 +235,15 @@ class RestSurface:
         apart = person != other
         lower[apart] = upper[apart] = np.inf
         return lower, upper
+
+
+@functools.lru_cache(maxsize=4)
+def _rest_parts(content):
+    """The connected part of each face, and the pairs of parts that lie in each other."""
+    manifold = manifold_of(content.faces, len(content.vertices))
+    of_face = np.zeros(len(content.faces), np.int64)
+    of_face[manifold.beside] = manifold.part[manifold.faces[:, 0]]
+    return of_face, parts_in_each_other(content.vertices, content.faces)
 
 
 def _as_surface(rest_vertices: Any, faces: Any):
@@ -208,6 +276,37 @@ def _as_surface(rest_vertices: Any, faces: Any):
         )
     check_indices(corners, len(vertices))
     return vertices.astype(np.float64), corners.astype(np.int64)
+
+
+def _as_distances(distance: Any, count: int) -> tuple[tuple[float, ...], bytes]:
+    """The different distances, ascending, and which of them each face has, for hashing."""
+    if np.ndim(distance) == 0:
+        return (_as_distance(distance),), b""
+    if isinstance(distance, Tracer):
+        raise TypeError("distance must be known when traced: got a traced array; use NumPy.")
+    given = np.asarray(distance)
+    if given.dtype.kind not in "fiu" or given.shape != (count,):
+        raise ValueError(
+            f"distance must be a number or one for each of the {count} faces: got an array of "
+            f"{given.dtype} of shape {given.shape}."
+        )
+    given = given.astype(np.float64)
+    wrong = np.flatnonzero(~((given >= 0) & (given < np.inf)))
+    if len(wrong):
+        raise ValueError(
+            f"distance must be finite and not negative: got {given[wrong[0]]!r} for face "
+            f"{wrong[0]}; 0.3 m suits a body."
+        )
+    levels = np.unique(given)
+    if len(levels) > _MOST_LEVELS:
+        low = max(levels[levels > 0].min(), 1e-6 * levels[-1])
+        steps = np.geomspace(low, levels[-1], _MOST_LEVELS - 1)
+        levels = np.append(0.0, steps)
+        levels[-1] = given.max()
+    level = np.searchsorted(levels, given, side="right") - 1
+    used, level = np.unique(level, return_inverse=True)
+    kept = tuple(levels[used].tolist()) or (0.0,)
+    return kept, level.astype(np.uint8).tobytes() if len(kept) > 1 else b""
 
 
 def _as_distance(distance: Any) -> float:

@@ -2,6 +2,7 @@
 
 import numpy as np
 from helpers import box, inverted, join, moved, random_rotation, sampling, sphere
+from helpers_depth import DEEP, as_mesh
 
 from spt_jax.overlap.measure import measure
 
@@ -14,6 +15,8 @@ SOLIDS = {
     ),
     "inverted box": join(inverted(box()), box(center=(3.0, 0.0, 0.0))),
     "box in a box": join(box(), box(extents=(0.5, 0.4, 0.3), center=(0.1, 0.0, 0.0))),
+    "four boxes": moved(as_mesh(DEEP["four boxes"]), _TURNED),
+    "inverted nest": moved(as_mesh(DEEP["inverted nest"]), _TURNED),
     "apart": join(sphere(subdivisions=2), sphere(center=(2.5, 0.0, 0.0), subdivisions=2)),
 }
 _VERTICES = max(len(mesh[0]) for mesh in SOLIDS.values())

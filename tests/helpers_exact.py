@@ -15,8 +15,8 @@ _NO_CUTOFF = 1_000_000
 def exact_overlap(mesh: Mesh) -> tuple[float, np.ndarray]:
     """Volume and gradient, with CGAL's cuts and libigl's winding numbers.
 
-    On every piece the class c = sign(w_out) is constant, so the divergence theorem gives the volume
-    of what is overlapped, and c times the corner's weight at the piece's centre the gradient.
+    On every piece w_out is constant, so the divergence theorem gives the integral of w (w - 1) / 2,
+    and w_out times the corner's weight at the piece's centre the gradient.
     """
     vertices, faces = mesh
     cut, pieces, _, origin, *_ = cgal.remesh_self_intersections(vertices, faces, cutoff=_NO_CUTOFF)
@@ -28,7 +28,7 @@ def exact_overlap(mesh: Mesh) -> tuple[float, np.ndarray]:
     center = corner.mean(axis=1)
     ahead = _IN_FRONT * np.ptp(vertices, axis=0).max() * normal / size[kept, None]
     winding = np.asarray(igl.winding_number(vertices, faces, center + ahead))
-    kind = np.sign(np.rint(winding))
+    kind = np.rint(winding)
     volume = kind @ np.einsum("ki,ki->k", corner[:, 0] - vertices.mean(axis=0), normal) / 6
 
     whole = vertices[faces[origin]]

@@ -64,10 +64,10 @@ def test_equals_the_paper_s_listing(direction, rng):
 def test_precedence_is_out_then_in_then_clear():
     faces = np.array([[0, 1, 2], [2, 3, 4], [4, 5, 6], [7, 8, 9]])
 
-    def overlaps(face, class_sign):
+    def overlaps(face, outer):
         ends = np.stack([face, face], axis=1)
         count = len(ends)
-        nothing = np.zeros((count, 2, 3)), np.array(class_sign), np.zeros(count)
+        nothing = np.zeros((count, 2, 3)), np.array(outer), np.zeros(count)
         return Overlaps(np.arange(count), ends, np.full((count, 2), -1), *nothing)
 
     # 2 is a corner of an out and of an in triangle, 4 of an in and of a clear one; nothing

@@ -11,9 +11,7 @@ from spt_jax import self_intersection_penalty
 from spt_jax.device.pair_search import over_crossing_pairs
 from spt_jax.device.patches import spread
 from spt_jax.device.triangle_pairs import cross_each_other
-from spt_jax.overlap.rays.beam import orthogonal_directions
 from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
-from spt_jax.overlap.triangles.sheets import find_sheets
 
 
 def test_groups_as_on_the_host():
@@ -52,8 +50,8 @@ def test_triangles_that_cross(rng):
     )
     pairs = {(f, g) for f, g in zip(first[found], second[found], strict=True)}
     assert len(pairs) > 30
-    sheets = find_sheets(vertices, faces, np.array(orthogonal_directions(3)))
-    assert pairs == {tuple(sorted(pair)) for pair in sheets.pairs.tolist()}
+    expected = face_pairs(edge_crossings(vertices, faces))
+    assert pairs == {tuple(sorted(pair)) for pair in expected.tolist()}
 
 
 @pytest.mark.parametrize("name", SOLIDS)

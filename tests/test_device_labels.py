@@ -7,6 +7,7 @@ from helpers import body_faces, posed_bodies
 from helpers_device import SOLIDS, padded
 
 from spt_jax import classify_vertices
+from spt_jax.overlap.exact import ExactSurface
 
 FRAMES = ["crawl/0092", "roll/0056", "run/0010"]
 
@@ -39,7 +40,11 @@ def test_vertex_rule_of_bodies():
     bodies = posed_bodies(FRAMES).astype(np.float32)
     label = on_device(bodies, body_faces().astype(np.int32), "vertex")
     expected = classes(bodies, body_faces(), "vertex", "numpy")
-    np.testing.assert_array_equal(label, expected)
+    # A vertex whose own triangles pass through each other has several numbers.
+    for vertices, ours, hosts in zip(bodies, np.asarray(label), np.asarray(expected), strict=True):
+        surface = ExactSurface(vertices.astype(float), body_faces(), 1.2e-7)
+        cusps = np.unique(surface.contours.cusp)
+        assert set(np.flatnonzero(ours != hosts)) <= set(cusps) and len(cusps) < 200
     assert (np.count_nonzero(label, axis=1) > 20).all()
 
 

@@ -45,7 +45,7 @@ def check(values, gradients):
 def test_nested_vmap_over_meshes_and_faces_in_shard_map():
     """Several meshes at once, of which some take more strips than others, over one device."""
     settings = Xla(segments=200, crossings=600, meshes_at_once=4)
-    vertices, faces = (x.reshape(2, 3, *x.shape[1:]) for x in batch())
+    vertices, faces = (x.reshape(2, 4, *x.shape[1:]) for x in batch())
     one = jax.value_and_grad(functools.partial(penalty, settings=settings))
     spec = PartitionSpec("meshes")
     sharded = jax.shard_map(

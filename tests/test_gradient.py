@@ -70,7 +70,7 @@ def test_pushing_two_boxes_together_changes_the_volume_by_their_contact(rng):
 
 
 def test_wholly_immersed_and_inverted_solids_have_eq_9_as_gradient(rng):
-    """c is constant over the whole solid, so the boundary integral is (1/3) sum S_l n_l."""
+    """w_out is 1 or -1 all over the solid, so the boundary integral is (1/3) sum S_l n_l."""
     outer, inner = box((3, 3, 3)), moved(sphere(0.9, subdivisions=2), random_rotation(rng))
     for mesh, count in ((join(inner, outer), len(inner[0])), (inverted(inner), len(inner[0]))):
         volume, gradient = value_and_gradient(mesh, 400)

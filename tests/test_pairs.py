@@ -9,6 +9,8 @@ import pytest
 from helpers import body_faces, box, join, moved, posed_bodies, random_rotation, sphere
 
 from spt_jax.overlap.triangles import pair_boxes, pair_layout
+from spt_jax.overlap.triangles.contours import find_contours
+from spt_jax.overlap.triangles.pair_layout import prepared
 from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 
 
@@ -271,9 +273,15 @@ def test_an_edge_meets_one_of_the_two_triangles_that_it_passes_between(rng):
         assert sorted(vertical) == list(range(first, first + count))
 
 
-def test_triangles_in_one_plane_do_not_pass_through_each_other(rng):
+def test_triangles_in_one_plane_only_touch(rng):
+    """They are told from others of the same crossings by the contours."""
     flat = np.concatenate([rng.normal(size=(30, 2)), np.zeros((30, 1))], axis=1)
-    assert found_in((flat, np.arange(30).reshape(10, 3))) == set()
+    faces = np.arange(30).reshape(10, 3)
+    upright = np.array([[0.0, 0, -1], [0, 0, 1], [0.3, 0.1, 1]])
+    mesh = np.concatenate([flat, upright]), np.concatenate([faces, [[30, 31, 32]]])
+    found = find_contours(mesh[0], prepared(mesh[1], 33).topology, edge_crossings(*mesh))
+    proper = found.pair[found.proper(*mesh, 1e-15)]
+    assert 0 < len(proper) < len(found.pair) and (proper[:, 1] == 10).all()
 
 
 def test_among_keeps_what_touches_the_marked_faces(rng):

@@ -87,12 +87,19 @@ def test_a_profile_is_the_winding_number_along_its_ray():
     assert along.depth[0] == pytest.approx(0.0, abs=0.02)
 
 
-def test_the_profile_and_the_image_measure_one_length(balls):
-    found = cast_beam(*balls, "front", 150)
+@pytest.mark.parametrize("third", [False, True])
+def test_the_profile_and_the_image_measure_one_length(balls, third):
+    vertices, faces = balls
+    if third:  # a ball that both others overlap, and their overlap too
+        more = vertices[: len(vertices) // 2] * 0.8 + np.array([0.4, 0.1, 0.3])
+        of_more = faces[: len(faces) // 2] + len(vertices)
+        vertices, faces = np.concatenate([vertices, more]), np.concatenate([faces, of_more])
+    found = cast_beam(vertices, faces, "front", 150)
+    assert found.crossings.sign.cumsum().max() == (3 if third else 2)
     for ray in np.flatnonzero(found.overlap)[::97]:
         along = profile(found, int(ray))
         gaps = np.diff(along.depth)
-        length = (gaps * np.maximum(along.counter[:-1] - 1, 0)).sum()
+        length = (gaps * along.counter[:-1] * (along.counter[:-1] - 1) / 2).sum()
         assert length == pytest.approx(found.overlap[ray], abs=1e-9)
 
 

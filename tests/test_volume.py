@@ -47,12 +47,13 @@ SOLIDS = {
     ),
     "three spheres in a row": (
         join(*(sphere(center=(0.7 * k, 0.02 * k, 0), subdivisions=5) for k in range(3))),
-        2 * lens_volume(np.hypot(0.7, 0.02)),  # the lens of the outer two counts twice
+        # The three pairs: where all three overlap, the lens of the outer two, counts three times.
+        2 * lens_volume(np.hypot(0.7, 0.02)) + lens_volume(np.hypot(1.4, 0.04)),
         4e-3,
     ),
     "sphere in sphere in sphere": (
         join(sphere(1.0), sphere(0.7), sphere(0.4)),
-        signed_volume(*sphere(0.7)) + signed_volume(*sphere(0.4)),
+        signed_volume(*sphere(0.7)) + 2 * signed_volume(*sphere(0.4)),
         1e-3,
     ),
     "inverted shell": (inverted(sphere()), signed_volume(*sphere()), 1e-3),
@@ -159,11 +160,12 @@ def test_disjoint_union_adds(rng):
     assert volume(join(first, second)) == pytest.approx(volume(first) + volume(second), rel=5e-3)
 
 
-def test_triple_overlap_counts_twice(rng):
+def test_every_pair_of_a_stack_counts_once(rng):
     one = moved(sphere(subdivisions=3), random_rotation(rng))
     for copies in (1, 2, 3, 4):
         stack = join(*[moved(one, scale=1 - 0.01 * k) for k in range(copies)])
-        expected = sum(signed_volume(*one) * (1 - 0.01 * k) ** 3 for k in range(1, copies))
+        # The k-th lies in k larger ones.
+        expected = sum(k * signed_volume(*one) * (1 - 0.01 * k) ** 3 for k in range(1, copies))
         assert volume(stack, 256) == pytest.approx(expected, rel=2e-3, abs=1e-12)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float, Int
 
+from spt_jax.body.fold_distances import fold_distances
 from spt_jax.groups import Pairs, neighbour_pairs, part_groups
 from spt_jax.rest_surface import RestSurface
 
@@ -103,8 +104,10 @@ class BodyModel(eqx.Module):
     def rest_surface(self) -> RestSurface:
         """The body's surface at rest, in the mean shape: what the penalty tells folds by.
 
-        Overlaps of sheets nearer to each other than 0.3 m along it are folds;
-        `body.rest_surface.within(0.2)` is for another distance.
+        Triangles that intersect nearer to each other along it than what lies there allows fold:
+        0.3 m on trunk and limbs, 2 to 4 cm on fingers, from the girth of what each joint moves
+        (`spt_jax.body.fold_distances`). `body.rest_surface.within(0.2)` is for one distance
+        everywhere, and `within(array)` for one a face.
 
         Raises:
             TypeError: inside jit, grad or vmap of a function that the body is an argument of. Take
@@ -113,9 +116,15 @@ class BodyModel(eqx.Module):
         Example:
             >>> from spt_jax.body import load_body
             >>> load_body().rest_surface
-            RestSurface(24540 faces, distance=0.3)
+            RestSurface(24540 faces, distance=0.033 to 0.3)
         """
-        return RestSurface(self.template, self.faces)
+        traced = (self.template, self.faces, self.weights, self.joint_template)
+        if any(isinstance(array, Tracer) for array in traced):
+            return RestSurface(self.template, self.faces)  # which says what to do
+        template, faces = np.asarray(self.template, np.float64), np.asarray(self.faces, np.int64)
+        weights, joints = np.asarray(self.weights), np.asarray(self.joint_template, np.float64)
+        allowed = fold_distances(template, faces, weights, joints, self.parents)
+        return RestSurface(self.template, self.faces, allowed)
 
     @property
     def part_groups(self) -> Int[np.ndarray, "F"]:

@@ -1,10 +1,13 @@
 """`backend="xla"`: the penalty in pure JAX, without a callback, for accelerators.
 
-`self_intersection_penalty`, `paper_penalty` and `classify_vertices` take it, and choose it by
-themselves where JAX runs on a GPU or TPU.
+`self_intersection_penalty`, `paper_penalty` and `classify_vertices` take it where it is asked for.
+By themselves they go to the host, on a GPU or TPU too: there the volume is exact, here it is
+sampled (`arguments.as_backend`).
 
-What is the same as on the host: the rays, one by one, since both cast them through the same lattice
-in the world, and which overlaps count: the triangles that pass through each other are all found
+What is the same as on the host: the measure, w (w - 1) / 2 for every point of winding number w, so
+that each pair of solids counts once where it overlaps, and w_out for every crossing in the gradient
+(`overlap.rays.levels`); the rays, one by one, since both cast them through the same lattice in the
+world; and which overlaps count: the triangles that pass through each other are all found
 (`pair_search`), so groups and folds are decided as there, but for a few pairs of triangles about
 `distance` apart at rest, where shortest paths would have to be walked. In float64 values and
 gradients agree to 1e-12 and labels are equal. In float32 a ray within rounding of an edge may meet
@@ -17,6 +20,8 @@ What differs:
 - Overlaps are connected where their surfaces are, so that on meshes of few large triangles they run
   into each other. What does not count takes two passes over the rays; `folds` also a table of 50 MB
   for the embedded body, once.
+- An interval counts or is left out as a whole. Where three solids overlap and one of their pairs is
+  left out, which of the other pairs go with it depends on the order in which rays meet them.
 - More than 16,000 parts (at 512 rays) over one another, or a row of the screen with more crossings
   than there is room for, give NaN, and `usage.device_usage` tells.
 

@@ -1,4 +1,9 @@
-"""Which side of its own triangles a direction takes from a vertex, as `triangles.vertex_cone`."""
+"""Which side of its own triangles a direction takes from a vertex.
+
+The nearest part of their cone decides by the side that it shows: a triangle, an edge with the
+sum of its normals, or the apex with the sum of all, weighed by their angles (Baerentzen and
+Aanaes 2005, https://doi.org/10.1109/TVCG.2005.49).
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int

@@ -26,8 +26,8 @@ def boundary_gradient(
     seen = jnp.zeros_like(longest)
     for k in range(len(ray.directions)):
         seen = seen + _dot(normal, ray.directions[k]) ** 2
-    sign = jnp.repeat(intervals.class_sign, 2).astype(normal.dtype)
-    weight = sign * jnp.abs(_dot(normal, ray.direction)) * ray.area
+    outer = jnp.repeat(intervals.outer, 2).astype(normal.dtype)
+    weight = outer * jnp.abs(_dot(normal, ray.direction)) * ray.area
     weight = weight / jnp.where(seen > 0, seen, jnp.ones_like(seen))
     force = weight[:, None] * normal
     shares = intervals.barycentric.reshape(-1, 3)[:, :, None] * force[:, None, :]
@@ -38,8 +38,8 @@ def add_codes(
     codes: Int[Array, "V"], faces: Int[Array, "F 3"], intervals: Intervals
 ) -> Int[Array, "V"]:
     """What the triangle rule says of the ends' corners: V_out before V_in before V_0."""
-    sign = jnp.repeat(intervals.class_sign, 6)
-    code = jnp.where(sign > 0, _CODE_OUT, jnp.where(sign < 0, _CODE_INSIDE, 0))
+    outer = jnp.repeat(intervals.outer, 6)
+    code = jnp.where(outer > 0, _CODE_OUT, jnp.where(outer < 0, _CODE_INSIDE, 0))
     return codes.at[take(faces, intervals.ends.reshape(-1)).reshape(-1)].max(code)
 
 

@@ -1,7 +1,9 @@
 """Counters along each ray and the overlaps that they enclose, as `overlap.rays.levels`.
 
-One cumulative sum counts for all rays, since every ray's signs sum to zero. A second sort, by level
-and place, puts the crossing that opens an interval next to the one that closes it.
+A gap of winding number w counts w (w - 1) / 2 times, so an interval of level l, of which w_out at
+its ends is l - 1, counts |l - 1| times. One cumulative sum counts for all rays, since every ray's
+signs sum to zero. A second sort, by level and place, puts the crossing that opens an interval next
+to the one that closes it.
 """
 
 from typing import NamedTuple
@@ -22,15 +24,25 @@ class Intervals(NamedTuple):
         ends: the triangles that each interval begins and ends at.
         around: the triangles that open and close the solid around it; -1 where none does.
         barycentric: of the points where the ray crosses `ends`.
-        class_sign: sign(w_out) of both ends: +1 on V_out, -1 on V_in, 0 at unused places.
-        length: from end to end, in the mesh's unit; 0 at unused places.
+        outer: w_out at both ends, which is the interval's level less one: positive on V_out,
+            negative on V_in, 0 at unused places.
+        length: from end to end, in the mesh's unit; 0 at unused places. The interval counts
+            |w_out| times.
     """
 
     ends: Int[Array, "N 2"]
     around: Int[Array, "N 2"]
     barycentric: Float[Array, "N 2 3"]
-    class_sign: Int[Array, "N"]
+    outer: Int[Array, "N"]
     length: Float[Array, "N"]
+
+    @property
+    def size(self) -> Float[Array, ""]:
+        """The lengths, each as often as it counts: times the area of a ray, the overlap volume."""
+        counted = jnp.abs(self.outer).astype(self.length.dtype) * self.length
+        # In two steps: float32 sums of many small lengths lose less.
+        counted = jnp.pad(counted, (0, -len(counted) % 256))
+        return counted.reshape(256, -1).sum(axis=1).sum()
 
 
 def most_levels(size: int) -> int:
@@ -82,7 +94,7 @@ def find_overlaps(
         ends=ends,
         around=_around(key, opens, closes, levels, crossings.face, most),
         barycentric=barycentric.reshape(-1, 2, 3),
-        class_sign=jnp.where(kept, jnp.sign(levels - 1), 0),
+        outer=jnp.where(kept, levels - 1, 0),
         length=jnp.where(kept, length, jnp.zeros_like(length)) * screen.pixel[0],
     ), deepest
 
@@ -139,6 +151,6 @@ def _around(key, opens, closes, levels, face, most) -> Int[Array, "N 2"]:
 def kept_only(intervals: Intervals, counted: Bool[Array, "N"]) -> Intervals:
     """The intervals with those that do not count taken out."""
     return intervals._replace(
-        class_sign=jnp.where(counted, intervals.class_sign, 0),
+        outer=jnp.where(counted, intervals.outer, 0),
         length=jnp.where(counted, intervals.length, jnp.zeros_like(intervals.length)),
     )

@@ -1,9 +1,20 @@
-"""The winding number just outside every vertex, as `overlap.triangles.vertex_winding`.
+"""The winding number just outside every vertex: a ray through each against all triangles.
 
-A ray through each vertex counts the other triangles in front of it. Vertices are put into strips of
-the screen, equally many each, and sorted along the strip, so that a triangle meets few vertices
-that it cannot contain. Triangle by strip, and then triangle by vertex, are lists of unknown length;
-they are worked off in pieces, so that no list is too long for its array.
+A ray through vertex p meets p's own triangles at p, and others in front of p and behind it. With
++1 where it enters and -1 where it leaves, let F be the sum in front, B the one behind and O that
+of p's own triangles. On a closed mesh F + O + B = 0; the winding number is F just before p and
+F + O just after. Where O is +1 or -1 the ray goes through the surface at p, whose outer side has
+w_out = min(F, F + O). Where O is 0 the ray only touches the surface there, as on a silhouette:
+either both of its sides are outside the cone of p's triangles, and w_out = F, or both are within,
+and w_out = F - 1. The part of the cone that is nearest to the ray tells which (`cone.py`).
+
+The host follows the winding number along the surface instead (`overlap.triangles.winding`); the two
+may differ at a vertex whose own triangles pass through one another, which has several.
+
+Vertices are put into strips of the screen, equally many each, and sorted along the strip, so that a
+triangle meets few vertices that it cannot contain. Triangle by strip, and then triangle by vertex,
+are lists of unknown length; they are worked off in pieces, so that no list is too long for its
+array.
 """
 
 from typing import NamedTuple
@@ -16,7 +27,19 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax.device.arrays import cumulative_sum, expand, last_within, take
 from spt_jax.device.cone import within_cone
 from spt_jax.overlap.measure import Directions
-from spt_jax.overlap.triangles.vertex_winding import SPARE, THINNEST, generic_frame
+from spt_jax.overlap.rays.beam import screen_frame
+
+# The rays lean from the direction that is asked for, by these parts of the screen's axes, and the
+# screen is turned about them: what is modelled has its faces and edges along the axes, and a face
+# seen exactly edge-on is met or missed by rounding.
+_LEAN = (0.1381966011250105, 0.0901699437494742)
+_TURN = np.arctan((np.sqrt(5.0) - 1.0) / 2.0)
+
+# For vertices whose rays meet a hole in all of the caller's directions.
+_SPARE = np.array([[0.48, -0.36, -0.8], [-0.64, 0.6, -0.48]])
+
+# A sheet nearer to the vertex than this part of the mesh's size touches it, as in `levels.py`.
+_THINNEST = 1e-7
 
 # Pieces of the two lists, at most.
 _MOST_RUNS, _MOST_PAIRS = 1 << 16, 1 << 17
@@ -30,8 +53,8 @@ def vertex_labels(
     The first direction serves all vertices; the next ones, and two of our own, those whose ray met
     a hole. A vertex that no direction decides is 0, and so is one that no triangle uses.
     """
-    rows = [*(np.array(direction) for direction in directions), *SPARE]
-    frames = jnp.asarray(np.stack([generic_frame(row) for row in rows]), vertices.dtype)
+    rows = [*(np.array(direction) for direction in directions), *_SPARE]
+    frames = jnp.asarray(np.stack([_generic_frame(row) for row in rows]), vertices.dtype)
     used = jnp.zeros(len(vertices), jnp.int32).at[faces.reshape(-1)].max(1) > 0
 
     def more(state):
@@ -47,6 +70,12 @@ def vertex_labels(
 
     start = jnp.int32(0), jnp.zeros(len(vertices), jnp.int32), used
     return jax.lax.while_loop(more, look, start)[1]
+
+
+def _generic_frame(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The frame of rays along a direction, leant and turned away from everything modelled."""
+    u, v, d = screen_frame(direction.astype(np.float64))
+    return screen_frame(d + _LEAN[0] * u + _LEAN[1] * v, _TURN)
 
 
 class _Grid(NamedTuple):
@@ -119,7 +148,7 @@ def _bounds(
     grid = _grid(screen)
     triangles = _triangles(grid, faces)
     extent = (screen.max(axis=0) - screen.min(axis=0)).max()
-    thinnest = max(THINNEST, 4 * float(jnp.finfo(vertices.dtype).eps)) * extent
+    thinnest = max(_THINNEST, 4 * float(jnp.finfo(vertices.dtype).eps)) * extent
 
     # A row belongs to an edge from its lower end up to below its higher one, and a point on an
     # edge is not to the left of it: of its own corners a triangle contains at most the middle one.

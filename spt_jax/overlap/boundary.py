@@ -1,10 +1,11 @@
 """The gradient of the overlap volume, as one vector per vertex.
 
-Moving the surface with velocity v changes the overlap volume by the integral of c (v . n) over
-the surface, c = sign(w_out) being the class of Algorithm 1. With linear triangles the gradient at
-vertex t is the sum over its triangles of n times the integral of c lambda_t; where c is constant
-around t that is the paper's Eq. 9. Rays are a quadrature of the integral: a crossing stands for
-the surface area a / |n . d| of its triangle.
+Moving the surface with velocity v changes the overlap volume, the integral of w (w - 1) / 2, by
+that of w_out (v . n) over the surface: a point that it sweeps goes from w_out to w_out + 1. With
+linear triangles the gradient at vertex t is the sum over its triangles of n times the integral of
+w_out lambda_t; where w_out is the same all around t, and 0, 1 or -1, which is the class of
+Algorithm 1, that is the paper's Eq. 9. Rays are a quadrature of the integral: a crossing stands
+for the surface area a / |n . d| of its triangle.
 """
 
 import numpy as np
@@ -66,7 +67,7 @@ def boundary_gradient(
     seen = np.einsum("kd,kd->k", cosines, cosines)
     # area * (n.d)^2 / sum (n.d')^2 * n, with lengths of normals cancelling: no root, no division
     # by a cosine that may vanish.
-    weight = np.repeat(overlaps.class_sign, 2) * np.abs(normal @ beam.direction) * beam.ray_area
+    weight = np.repeat(overlaps.outer, 2) * np.abs(normal @ beam.direction) * beam.ray_area
     weight = weight / np.where(seen > 0, seen, 1.0)
     force = weight[:, None] * normal
     shares = overlaps.barycentric.reshape(-1, 3, 1) * force[:, None, :]

@@ -1,11 +1,19 @@
 """Which overlaps count: pairs of groups left out, and folds told from collisions.
 
-Overlaps are decided twice. A region of overlap counts where anywhere along its rim two triangles
-cross that may collide; that settles the folds of skinning, whose sheets meet at a crease. Within a
-region that counts, an interval on a ray counts where its four sheets may collide: the two solids
-that overlap there either cross or lie one in the other, and every end of one must be apart from
-every end of the other. Intervals at triangles which collide at the rim count too, so that a region
-that counts never weighs nothing.
+Between two connected parts of the surface an overlap counts or not as a whole, where their groups
+say so, and always where no path along the rest surface connects them: such overlaps are measured by
+winding numbers of the parts that count, exactly. Parts that lie in each other at rest, as eyeballs
+in a head, are meant to, and do not count.
+
+Within one part the intersection contours decide. A region of overlap counts with the share of its
+contour's length along which the intersecting triangles are far from each other at rest: wholly
+where all of it is, as for two limbs; not at all where none is, as for the crease of a bent elbow;
+and in part where a fold and a collision hang together.
+
+Rays that were asked for tell intervals one by one: an interval in a region that counts does so
+where its four sheets may collide: the two solids that overlap there either cross or lie one in the
+other, and every end of one must be apart from every end of the other. Intervals at triangles which
+collide at the contour count too, so that a region that counts never weighs nothing.
 """
 
 import functools
@@ -16,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.rays.levels import Overlaps
-from spt_jax.overlap.triangles.sheets import Sheets
+from spt_jax.overlap.triangles.manifold import Manifold
 
 # Between parts that no path along the rest surface connects.
 UNCONNECTED = 1e6
@@ -36,7 +44,13 @@ class Rest(Protocol):
     def near(
         self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"], exact: bool = False
     ) -> Bool[np.ndarray, "N"]:
-        """Whether it is less than `distance`."""
+        """Whether they are folds of each other: nearer than where they lie allows."""
+        ...
+
+    def overlap_at_rest(
+        self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether the connected parts of two triangles lie in each other at rest."""
         ...
 
 
@@ -62,80 +76,115 @@ class Exclusions(NamedTuple):
 NOTHING = Exclusions()
 
 
-@dataclass(frozen=True)
-class Rims:
-    """What the triangles that pass through each other say of the regions of overlap.
+@dataclass(frozen=True, eq=False)
+class PartRules:
+    """Which overlaps between two connected parts count, and which the contour has to judge.
 
     Attributes:
-        collides: which pairs of `Sheets.pairs` collide, by groups and rest distance.
-        pairs: how many pairs run along each region's rim.
-        colliding: how many of those collide.
+        group: of each part, as a row of the table of ignored pairs; -1 where it has several.
+        face: one of the faces given, for each part.
+        ignored: the table.
+        rest: the surface at rest.
     """
 
-    collides: Bool[np.ndarray, "P"]
-    pairs: Int[np.ndarray, "R"]
-    colliding: Int[np.ndarray, "R"]
+    group: Int[np.ndarray, "P"]
+    face: Int[np.ndarray, "P"]
+    ignored: Bool[np.ndarray, "G G"]
+    rest: Any
 
-    @property
-    def rimless(self) -> Bool[np.ndarray, "R"]:
-        """Regions that nothing crosses: parts that lie within another whole, or inside out."""
-        return self.pairs == 0
+    def __call__(
+        self, first: Int[np.ndarray, "N"], second: Int[np.ndarray, "N"]
+    ) -> Bool[np.ndarray, "N 2"]:
+        """Whether overlaps of two parts count whole, and whether the contour judges them."""
+        judged = (self.group[first] < 0) | (self.group[second] < 0)
+        dropped = ~judged & self.ignored[self.group[first], self.group[second]]
+        if self.rest is not None:
+            f, g = self.face[first], self.face[second]
+            same = first == second
+            dropped |= ~same & self.rest.overlap_at_rest(f, g)
+            judged |= same | np.isfinite(self.rest.between_faces(f, g))
+        judged &= ~dropped
+        return np.stack([~judged & ~dropped, judged], axis=1)
 
-    @property
-    def may_count(self) -> Bool[np.ndarray, "R"]:
-        """Regions that have a collision along their rim, or no rim."""
-        return self.rimless | (self.colliding > 0)
 
-    @property
-    def undecided(self) -> Bool[np.ndarray, "R"]:
-        """Regions that the triangles do not decide: no rim, or collisions along a part of it."""
-        return self.rimless | ((self.colliding > 0) & (self.colliding < self.pairs))
+@functools.lru_cache(maxsize=8)
+def part_rules(exclusions: Exclusions, manifold: Manifold) -> PartRules:
+    """The rules for a surface's connected parts."""
+    part = manifold.part[manifold.faces[:, 0]]
+    face = np.zeros(manifold.num_parts, np.int64)
+    face[part[::-1]] = manifold.beside[::-1]
+    group, ignored = np.zeros(manifold.num_parts, np.int64), np.zeros((1, 1), bool)
+    if exclusions.groups is not None and exclusions.ignored:
+        groups, ignored = group_table(exclusions.groups, exclusions.ignored)
+        of_face = groups[manifold.beside]
+        low, high = np.full((2, manifold.num_parts), 0)
+        low[:] = len(ignored)
+        np.minimum.at(low, part, of_face)
+        np.maximum.at(high, part, of_face)
+        group = np.where(low == high, low, -1)
+        group[low == len(ignored)] = 0
+    return PartRules(group, face, ignored, exclusions.rest)
 
 
-def judge_rims(exclusions: Exclusions, sheets: Sheets) -> Rims:
-    """Which crossings of triangles collide, and what that makes of the regions."""
-    f, g = sheets.pairs.T
-    collides = ~_ignored(exclusions, f, g)
+def pair_weights(
+    exclusions: Exclusions, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
+) -> Float[np.ndarray, "N"]:
+    """How much an intersection of two faces counts as a collision: 1, or 0 for a fold."""
+    weight = 1.0 - _ignored(exclusions, f, g)
     if exclusions.rest is not None:
-        collides &= ~exclusions.rest.near(f, g, exact=True)
-    region, count = sheets.region[f], sheets.num_regions
+        weight *= ~exclusions.rest.near(f, g, exact=True)
+    return weight
+
+
+@dataclass(frozen=True)
+class Rims:
+    """For intervals on rays: the regions of overlap, and what their contours say.
+
+    Attributes:
+        region: of each face given; -1 where it bounds none.
+        pairs: faces that intersect.
+        collides: which of these pairs collide.
+        may_count: regions that have a collision along their contour, or no contour.
+    """
+
+    region: Int[np.ndarray, "F"]
+    pairs: Int[np.ndarray, "P 2"]
+    collides: Bool[np.ndarray, "P"]
+    may_count: Bool[np.ndarray, "R"]
+
+
+def judged_rims(
+    exclusions: Exclusions,
+    region: Int[np.ndarray, "F"],
+    count: int,
+    pairs: Int[np.ndarray, "P 2"],
+) -> Rims:
+    """Which intersections of faces collide, and what that makes of the regions."""
+    collides = pair_weights(exclusions, *pairs.T) > 0
+    at = region[pairs[:, 0]]
+    total = np.bincount(at, minlength=count)
     return Rims(
-        collides,
-        np.bincount(region, minlength=count),
-        np.bincount(region[collides], minlength=count),
+        region, pairs, collides, (total == 0) | (np.bincount(at[collides], minlength=count) > 0)
     )
 
 
 def counted_intervals(
-    exclusions: Exclusions, sheets: Sheets, rims: Rims, beams: list[Overlaps]
+    exclusions: Exclusions, rims: Rims, beams: list[Overlaps]
 ) -> list[Bool[np.ndarray, "N"]]:
     """Which intervals of each beam count."""
     allowed = np.append(rims.may_count, True)  # -1: in no region
-    collides = np.zeros(len(sheets.region), bool)
-    collides[sheets.pairs[rims.collides]] = True
+    collides = np.zeros(len(rims.region), bool)
+    collides[rims.pairs[rims.collides]] = True
     # What folds has few sheets far from each other, and one end at the rim will do. Groups tell
     # the sheets apart by themselves: of two bodies, one end would add 6 % of folds to what is
     # between them, both ends add 0.2 %.
     at_rim = np.any if exclusions.rest is not None else np.all
     counted = []
     for overlaps in beams:
-        region = sheets.region[overlaps.ends].max(axis=1, initial=-1)
+        region = rims.region[overlaps.ends].max(axis=1, initial=-1)
         rim = at_rim(collides[overlaps.ends], axis=1)
         counted.append(allowed[region] & (rim | _apart(exclusions, overlaps)))
     return counted
-
-
-def counted_labels(
-    sheets: Sheets, faces: Int[np.ndarray, "F 3"], counted: Bool[np.ndarray, "R"]
-) -> Int[np.ndarray, "V"]:
-    """The vertices' classes sign(w_out), 0 where their region of overlap does not count."""
-    label = np.sign(sheets.winding).astype(np.int8)
-    if not counted.all():
-        touched = counted[sheets.region[sheets.faces]]
-        kept = np.zeros(len(label), bool)
-        kept[faces[sheets.faces[touched]]] = True
-        label[~kept] = 0
-    return label
 
 
 def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
@@ -159,7 +208,7 @@ def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
     if exclusions.rest is not None:
         for name, pair in pairs.items():
             along = np.minimum(exclusions.rest.between_faces(*pair), UNCONNECTED)
-            far[name] = along >= exclusions.rest.distance
+            far[name] = ~exclusions.rest.near(*pair)
             length[name] = length[name] + along
     crossing = length["ol"] + length["fc"] <= length["oc"] + length["fl"]
     apart = far["of"] & far["cl"] & np.where(crossing, far["oc"] & far["fl"], far["ol"] & far["fc"])

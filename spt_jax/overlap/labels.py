@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Float, Int
 
 from spt_jax.overlap.rays.levels import Overlaps
-from spt_jax.overlap.triangles.closed_form import ClosedForm
-from spt_jax.overlap.triangles.sheets import Sheets
 
 CLEAR, OUT, INSIDE = 0, 1, -1
 
@@ -45,23 +43,29 @@ def triangle_labels(
     label = np.zeros(num_vertices, np.int8)
     for value in (INSIDE, OUT):
         for found in overlaps:
-            label[faces[found.ends[found.class_sign == value]]] = value
+            label[faces[found.ends[np.sign(found.outer) == value]]] = value
     return label
 
 
 def add_labels_without_rays(
     label: Int[np.ndarray, "V"],
     faces: Int[np.ndarray, "F 3"],
-    sheets: Sheets,
-    closed: ClosedForm,
-    regions: Bool[np.ndarray, "R"],
+    found: Int[np.ndarray, "H"],
+    winding: Int[np.ndarray, "H 3"],
+    area: Float[np.ndarray, "H"],
 ) -> None:
-    """Add what the same rule says of some solved regions, as if rays went through every point."""
-    kept = regions[sheets.region[sheets.faces]]
-    corners = faces[sheets.faces[kept]]
-    winding = sheets.winding[corners]
+    """Add what the same rule says of some faces, as if rays went through every point.
+
+    Args:
+        label: to be added to.
+        faces: of the mesh.
+        found: faces that bound overlaps.
+        winding: w_out at the corners of these.
+        area: the integral of w_out over each, as a part of its area.
+    """
+    corners = faces[found]
     # A triangle cut between its corners has the class of what is cut off it.
-    part = np.where(winding.any(axis=1), 0.0, closed.share[kept].sum(axis=1))
+    part = np.where(winding.any(axis=1), 0.0, area)
     inside, out = np.zeros(len(label), bool), label == OUT
     inside[corners[(winding < 0).any(axis=1) | (part < -_SLIVER)]] = True
     out[corners[(winding > 0).any(axis=1) | (part > _SLIVER)]] = True

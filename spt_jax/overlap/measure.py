@@ -1,43 +1,43 @@
-"""One mesh through all of its beams: volume, gradient and labels, for `host.py` and `report.py`."""
+"""One mesh measured: volume, gradient and labels, exactly or by rays."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
-from spt_jax.overlap.exclusions import (
-    NOTHING,
-    Exclusions,
-    Rims,
-    counted_intervals,
-    counted_labels,
-    judge_rims,
-)
+from spt_jax.overlap.exact import ExactOverlap, ExactSurface, regions_of
+from spt_jax.overlap.exclusions import NOTHING, Exclusions, Rims, counted_intervals, judged_rims
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
-from spt_jax.overlap.rays.beam import Beam, Rays, ScreenPoints, aim
+from spt_jax.overlap.rays.beam import Beam, Rays, aim
 from spt_jax.overlap.rays.crossings import cast
-from spt_jax.overlap.rays.density import aim_at_sheets
 from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
-from spt_jax.overlap.triangles import closed_form
-from spt_jax.overlap.triangles.closed_form import ClosedForm
-from spt_jax.overlap.triangles.sheets import Sheets, find_sheets
+from spt_jax.overlap.triangles.pairs import Entangled
 
 Directions = tuple[tuple[float, float, float], ...]
 Value = Literal["volume", "ratio"]
 Gradient = Literal["boundary", "vertex", "unit"]
 Rule = Literal["vertex", "triangle"]
 
-
 # Of a mesh, in units in the last place of its largest coordinate. In float32 a body that stands 14
 # km from the origin is this small: its triangles are as large as the rounding.
 LEAST_EXTENT = 1024
 
+# Of the largest coordinate: volumes beyond would overflow, or vanish.
+LEAST_SIZE, MOST_SIZE = 1e-100, 1e100
+
+# Where the exact sums do not close, which no closed mesh has been seen to do.
+_FALLBACK_RAYS = 512
+
+
+class Unmeasurable(ValueError):
+    """A mesh has no surface that could be measured; the message says why."""
+
 
 class Sampling(NamedTuple):
-    """How a mesh is sampled: the directions of the beams and the rays of each."""
+    """How a mesh is measured: "auto", exactly, or by rays, and the directions of the beams."""
 
     rays: Rays
     directions: Directions
@@ -64,74 +64,57 @@ class Probe:
     @property
     def volume(self) -> float:
         """E_d: the overlap lengths on the rays times the screen area of a ray."""
-        return float(self.overlaps.length.sum()) * self.beam.ray_area
+        return self.overlaps.size * self.beam.ray_area
 
     @property
     def total_volume(self) -> float:
         """The same of all overlaps, those counted that are left out."""
-        return float(self.everything.length.sum()) * self.beam.ray_area
+        return self.everything.size * self.beam.ray_area
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One mesh measured: all that its beams found, and what its triangles tell by themselves."""
+    """One mesh measured.
+
+    Attributes:
+        vertices, faces: the mesh.
+        sampling: how it is measured.
+        exclusions: what does not count.
+        surface: what intersects, found from the triangles whether rays are cast or not.
+    """
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     sampling: Sampling
     exclusions: Exclusions
+    surface: ExactSurface
 
     @cached_property
-    def sheets(self) -> Sheets:
-        """The triangles that bound overlaps, found without beams."""
-        directions = np.array(self.sampling.directions)
-        return find_sheets(self.vertices, self.faces, directions)
+    def overlap(self) -> ExactOverlap:
+        """What counts, from the triangles alone."""
+        return ExactOverlap(self.surface, self.exclusions)
 
     @cached_property
-    def closed_form(self) -> ClosedForm | None:
-        """What is known of the overlaps without rays; None where rays were asked for."""
-        if self.sampling.rays != "auto":
-            return None
-        return closed_form.solve(self.vertices, self.faces, self.sheets)
-
-    @cached_property
-    def _rims(self) -> Rims:
-        return judge_rims(self.exclusions, self.sheets)
-
-    @cached_property
-    def _counted(self) -> Bool[np.ndarray, "R"]:
+    def everything(self) -> ExactOverlap:
+        """The same with what does not count."""
         if not self.exclusions.any:
-            return np.ones(self.sheets.num_regions, bool)
-        counted, rimless = self._rims.may_count, self._rims.rimless
-        if rimless.any():
-            # Only rays tell what they lie in.
-            seen = np.zeros(self.sheets.num_regions + 1, bool)
-            for found in self.beams:
-                seen[self.sheets.region[found.overlaps.ends]] = True
-            counted = counted & (~rimless | seen[:-1])
-        return counted
+            return self.overlap
+        return ExactOverlap(self.surface)
 
-    @cached_property
-    def _exactly(self) -> Bool[np.ndarray, "R"]:
-        if self.closed_form is None:
-            return np.zeros(self.sheets.num_regions, bool)
-        if not self.exclusions.any:
-            return self.closed_form.solved
-        # A region that counts in part needs rays: they tell which part.
-        exactly = self.closed_form.solved & ~self._rims.undecided
-        return closed_form.without_entangled(
-            self.vertices, self.faces, self.sheets, self.closed_form, exactly
-        )
+    @property
+    def exact(self) -> bool:
+        """Whether the volume is exact: no rays were asked for, and all exact sums close."""
+        return self.sampling.rays == "auto" and self.overlap.sound
 
     @cached_property
     def beams(self) -> list[Probe]:
-        """Every beam of the sampling, cast through the mesh; none where none is needed."""
-        if self.sampling.rays == "auto" and self._exactly.all():
+        """Every beam of the sampling, cast through the mesh; none where it is measured exactly."""
+        if self.exact:
             return []
         found = [self._along(direction) for direction in self.sampling.directions]
         if self.exclusions.any:
             counted = counted_intervals(
-                self.exclusions, self.sheets, self._rims, [probe.everything for probe in found]
+                self.exclusions, self._rims, [probe.everything for probe in found]
             )
             found = [
                 replace(probe, overlaps=probe.everything.only(kept))
@@ -140,52 +123,48 @@ class Measurement:
         return found
 
     def _along(self, direction: tuple[float, float, float]) -> Probe:
-        rays, towards = self.sampling.rays, np.array(direction)
-        if rays != "auto":
-            return self._cast(*aim(self.vertices, towards, rays))
-        sheets, by_rays = self.sheets, ~self._exactly
-        bounding = sheets.faces[by_rays[sheets.region[sheets.faces]]]
-        probe = self._cast(*aim_at_sheets(self.vertices, self.faces, towards, sheets, bounding))
-        # Other regions lie behind the same tiles; what is in none was not told from the triangles.
-        region = sheets.region[probe.everything.ends]
-        own = np.append(by_rays, False)[region]
-        mine = own[:, 0] | own[:, 1] | (region < 0).all(axis=1)
-        kept = probe.everything.only(mine)
-        return replace(probe, overlaps=kept, everything=kept)
-
-    def _cast(self, beam: Beam, points: ScreenPoints) -> Probe:
+        rays = self.sampling.rays if self.sampling.rays != "auto" else _FALLBACK_RAYS
+        beam, points = aim(self.vertices, np.array(direction), rays)
         crossings = cast(beam, points, self.faces, simple_rays=False)
         overlaps = find_overlaps(beam, points, self.faces, crossings)
         return Probe(beam, overlaps, overlaps, crossings.met, crossings.open_rays)
 
     @property
+    def _rims(self) -> Rims:
+        (layer,) = self.surface.layers(NOTHING)
+        region, count = regions_of(self.surface, layer)
+        of_face = np.full(len(self.faces), -1)
+        of_face[self.surface.manifold.beside[layer.shares.faces]] = region
+        return judged_rims(self.exclusions, of_face, count, self.surface.pairs)
+
+    @property
     def volumes(self) -> list[float]:
         """The overlap volume that counts, as each beam sees it."""
-        exact = 0.0
-        if self.closed_form is not None:
-            exact = float(self.closed_form.volume[self._exactly & self._counted].sum())
-        beams = self.beams
-        if not beams:
-            return [exact] * len(self.sampling.directions)
-        return [exact + found.volume for found in beams]
+        if self.exact:
+            return [self.overlap.volume] * len(self.sampling.directions)
+        return [found.volume for found in self.beams]
 
     @property
     def volume(self) -> float:
-        """The overlap volume that counts: the mean of the beams' own."""
+        """The overlap volume that counts: exact, or the mean of the beams' own."""
         return float(np.mean(self.volumes))
 
     @property
     def total_volume(self) -> float:
         """The overlap volume with what is left out."""
-        exact = 0.0
-        if self.closed_form is not None:
-            exact = float(self.closed_form.volume[self._exactly].sum())
-        return exact + float(np.mean([found.total_volume for found in self.beams] or [0.0]))
+        if self.exact:
+            return self.everything.volume
+        return float(np.mean([found.total_volume for found in self.beams]))
 
     @property
     def crossing_pairs(self) -> int:
-        """Pairs of triangles that pass through each other and count."""
-        return int(np.count_nonzero(self._rims.collides))
+        """Pairs of triangles that intersect and count."""
+        return self.overlap.crossing_pairs
+
+    @property
+    def total_crossing_pairs(self) -> int:
+        """Pairs of triangles that intersect."""
+        return self.surface.count_pairs(self.surface.listed)
 
     def labels(self, rule: Rule) -> Int[np.ndarray, "V"]:
         """V_0, V_out and V_in of the overlaps that count.
@@ -193,12 +172,12 @@ class Measurement:
         By each vertex itself, or by Algorithm 1's triangle rule over all beams.
         """
         if rule == "vertex":
-            return counted_labels(self.sheets, self.faces, self._counted)
+            return np.sign(self.overlap.winding).astype(np.int8)
         overlaps = [found.overlaps for found in self.beams]
         label = triangle_labels(self.faces, overlaps, len(self.vertices))
-        if self.closed_form is not None:
-            exactly = self._exactly & self._counted
-            add_labels_without_rays(label, self.faces, self.sheets, self.closed_form, exactly)
+        if self.exact:
+            add_labels_without_rays(label, self.faces, *self.overlap.areas())
+            label = self.surface.of_given(label)
         return label
 
     def gradient(self, kind: Gradient, rule: Rule) -> Float[np.ndarray, "V 3"]:
@@ -206,12 +185,9 @@ class Measurement:
         if kind != "boundary":
             label = self.labels(rule)
             return vertex_gradient(self.vertices, self.faces, label, unit=kind == "unit")
+        if self.exact:
+            return self.overlap.gradient()
         total = np.zeros(self.vertices.shape)
-        if self.closed_form is not None:
-            exactly = self._exactly & self._counted
-            total += closed_form.gradient(
-                self.vertices, self.faces, self.sheets, self.closed_form, exactly
-            )
         directions = np.array([found.beam.direction for found in self.beams])
         for found in self.beams:
             total += boundary_gradient(
@@ -225,28 +201,59 @@ def measure(
     faces: Int[np.ndarray, "F 3"],
     sampling: Sampling,
     exclusions: Exclusions = NOTHING,
+    rounding: float = float(np.finfo(np.float64).eps),
 ) -> Measurement:
-    """A mesh to be measured; the work is done when something is asked of the result."""
-    return Measurement(vertices, faces, sampling, exclusions)
-
-
-def usable(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], rounding: float
-) -> bool:
-    """Whether the mesh can be measured.
-
-    Every coordinate finite, every index in range, and not so far from the origin that rounding has
-    eaten the shape.
+    """A mesh measured; what costs time beyond its intersections is done when it is asked for.
 
     Args:
-        vertices: positions.
-        faces: indices.
+        vertices: positions, in any unit.
+        faces: indices of each triangle's corners.
+        sampling: exactly or by rays.
+        exclusions: what does not count.
         rounding: machine epsilon of the numbers that the vertices came in.
+
+    Raises:
+        Unmeasurable: a coordinate that is not finite, a face out of range, coordinates whose cubes
+            overflow or vanish, a mesh so far from the origin that rounding has eaten its shape, or
+            so crumpled that its intersections are too many to be listed.
     """
+    reason = _unusable(vertices, faces, rounding)
+    if reason is not None:
+        raise Unmeasurable(reason)
+    try:
+        surface = ExactSurface(vertices, faces, rounding, merged=not exclusions.any)
+    except Entangled as tangle:
+        raise Unmeasurable(str(tangle)) from None
+    return Measurement(vertices, faces, sampling, exclusions, surface)
+
+
+def _unusable(vertices, faces, rounding: float) -> str | None:
     if not np.isfinite(vertices).all():
-        return False
+        wrong = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
+        return (
+            f"vertices must be finite: got NaN or infinity in {wrong} of {len(vertices)}; "
+            "remove or restore them."
+        )
     if faces.size == 0:
-        return True
+        return None
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(vertices):
+        return (
+            f"faces must index into vertices: got index {low if low < 0 else high} for "
+            f"{len(vertices)} vertices; indices are 0-based."
+        )
+    largest = np.abs(vertices).max()
+    if not (largest == 0 or LEAST_SIZE < largest < MOST_SIZE):
+        return (
+            f"vertices must be of a size whose cube is a number: got coordinates up to "
+            f"{largest:.3g}, where {LEAST_SIZE:.0e} to {MOST_SIZE:.0e} can be measured; take "
+            "another unit."
+        )
     extent = np.ptp(vertices.T.copy(), axis=1).max()
-    far = 0 < extent < LEAST_EXTENT * rounding * np.abs(vertices).max()
-    return bool(not far and faces.min() >= 0 and faces.max() < len(vertices))
+    if 0 < extent < LEAST_EXTENT * rounding * largest:
+        return (
+            f"vertices must not be farther from the origin than rounding allows: got a mesh of "
+            f"size {extent:.3g} at coordinates of {largest:.3g}; subtract its center, or take "
+            "float64."
+        )
+    return None

@@ -21,8 +21,8 @@ class RayImages(NamedTuple):
 
     Attributes:
         crossings: of each ray with triangles.
-        overlap: length of each ray within overlaps, counted as often as they overlap, in the
-            mesh's unit.
+        overlap: length of each ray within overlaps, counted once for every pair of solids that
+            overlap there, in the mesh's unit.
         ray_area: area of screen that one ray stands for.
     """
 
@@ -119,7 +119,8 @@ def cast_beam(vertices: Any, faces: Any, view: View, rays: int) -> BeamCast:
     beam, screen = on_lattice(points, axes, pixel)
     crossings = cast(beam, screen, triangles)
     overlaps = find_overlaps(beam, screen, triangles, crossings)
-    length = np.bincount(overlaps.ray, overlaps.length, minlength=beam.num_rays)
+    counted = np.abs(overlaps.outer) * overlaps.length
+    length = np.bincount(overlaps.ray, counted, minlength=beam.num_rays)
     return BeamCast(beam, screen, triangles, crossings, length)
 
 

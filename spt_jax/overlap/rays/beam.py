@@ -6,8 +6,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.overlap.rays.tiles import Tiles
-
 Rays = int | tuple[int, int] | Literal["auto"]
 
 # Pixel sizes come from this many steps per factor of two. Coarse enough that a mesh which moves
@@ -41,14 +39,12 @@ class Beam:
         pixel: width and height of a pixel, in the mesh's unit.
         origin: where the screen's first ray is, (column, row) in pixels from the world's origin.
         shape: rows and columns of the screen.
-        tiles: where on the screen rays are cast; None: everywhere.
     """
 
     frame: Float[np.ndarray, "3 3"]
     pixel: Float[np.ndarray, "2"]
     origin: Float[np.ndarray, "2"]
     shape: tuple[int, int]
-    tiles: Tiles | None = None
 
     @property
     def direction(self) -> Float[np.ndarray, "3"]:
@@ -63,19 +59,15 @@ class Beam:
     @property
     def num_rays(self) -> int:
         """Rays of the beam, those counted that miss the mesh."""
-        return self.shape[0] * self.shape[1] if self.tiles is None else self.tiles.num_pixels
+        return self.shape[0] * self.shape[1]
 
     def number(self, row: Int[np.ndarray, "N"], column: Int[np.ndarray, "N"]):
         """The rays' numbers; they rise by one from column to column."""
-        if self.tiles is None:
-            return row * self.shape[1] + column
-        return self.tiles.number(row, column)
+        return row * self.shape[1] + column
 
     def locate(self, ray: Int[np.ndarray, "N"]):
         """Row and column of numbered rays."""
-        if self.tiles is None:
-            return np.divmod(ray, self.shape[1])
-        return self.tiles.locate(ray)
+        return np.divmod(ray, self.shape[1])
 
 
 @dataclass(frozen=True)
@@ -145,18 +137,16 @@ def on_lattice(
     vertices: Float[np.ndarray, "V 3"],
     frame: Float[np.ndarray, "3 3"],
     pixel: Float[np.ndarray, "2"],
-    block: int = 1,
 ) -> tuple[Beam, ScreenPoints]:
     """The beam of this frame and pixel that covers the mesh, and the vertices on its screen.
 
-    The screen's first ray is one of those whose number on the world's lattice is a multiple of
-    `block`, so blocks of so many rays lie at the same places in the world for every mesh.
+    Rays lie at the same places in the world for every mesh.
     """
     column, row, depth = frame @ vertices.T
     column /= pixel[0]
     row /= pixel[1]
     lowest = np.array([column.min(), row.min()])
-    origin = np.floor((lowest + SHIFT) / block) * block - SHIFT
+    origin = np.floor(lowest + SHIFT) - SHIFT
     column -= origin[0]
     row -= origin[1]
     shape = (int(row.max()) + 2, int(column.max()) + 2)

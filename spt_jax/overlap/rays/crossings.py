@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.rays.beam import Beam, ScreenPoints
-from spt_jax.overlap.rays.scanlines import Rows, Spans, bands, paired, scan
-from spt_jax.overlap.rays.tiles import Tiles
+from spt_jax.overlap.rays.scanlines import Spans, bands, paired, scan
 
 # Depth is quantised only for the sort; below this many bits the packed key would confuse sheets
 # that are a few micrometres apart on a body, and a wider two-part sort takes over.
@@ -52,17 +51,12 @@ def cast(
     near = points.depth.min(initial=np.inf)
     thickness = points.depth.max(initial=-np.inf) - near
     sorter = _Sorter(near, thickness, len(faces), simple_rays)
-    if beam.tiles is not None:
-        spans = _within(beam.tiles, points, faces)
-        first = beam.tiles.number(spans.row, spans.first_column)
-        parts = [sorter.crossings(spans, first, beam.tiles.num_pixels)]
-    else:
-        parts = []
-        for rows, face in bands(points, faces, beam.shape):
-            spans = scan(points, faces, face, rows)
-            first = (spans.row - rows.begin) * beam.shape[1] + spans.first_column
-            num_pixels = (rows.end - rows.begin) * beam.shape[1]
-            parts.append(sorter.crossings(spans, first, num_pixels, rows.begin * beam.shape[1]))
+    parts = []
+    for rows, face in bands(points, faces, beam.shape):
+        spans = scan(points, faces, face, rows)
+        first = (spans.row - rows.begin) * beam.shape[1] + spans.first_column
+        num_pixels = (rows.end - rows.begin) * beam.shape[1]
+        parts.append(sorter.crossings(spans, first, num_pixels, rows.begin * beam.shape[1]))
     if len(parts) == 1:
         return parts[0]
     nothing = np.zeros(0, np.int64)
@@ -74,20 +68,6 @@ def cast(
         depth_quantum=max((part.depth_quantum for part in parts), default=0.0),
         open_rays=sum(part.open_rays for part in parts),
         met=sum(part.met for part in parts),
-    )
-
-
-def _within(tiles: Tiles, points: ScreenPoints, faces: Int[np.ndarray, "F 3"]) -> Spans:
-    # All triangles that touch a tile are there, so signs cancel on every ray of the tile.
-    face = tiles.touched_by(points.row, points.column, faces)
-    spans = scan(points, faces, face, Rows(*tiles.rows))
-    part, first_column, width = tiles.clip(spans.row, spans.first_column, spans.width)
-    spans = Spans(*(column[part] for column in spans))
-    skipped = first_column - spans.first_column
-    return spans._replace(
-        first_column=first_column,
-        width=width,
-        first_depth=spans.first_depth + skipped * spans.depth_step,
     )
 
 
@@ -188,7 +168,7 @@ def _worth_sorting(
     each, from their depths, before the sort, which costs more than all of this.
 
     Args:
-        num_pixels: of the band or the tiles.
+        num_pixels: of the band.
         slot: a crossing's pixel; that and num_pixels where the ray leaves.
         depth: along the ray.
         simple_rays: keep all rays but open ones.

@@ -1,13 +1,14 @@
 """Counters along each ray and the overlaps that they enclose.
 
 The counter after a crossing is the winding number w of the gap that follows it (Algorithm 1,
-lines 16-18, for any depth). A gap counts phi(w) = max(w - 1, 0) + max(-w, 0) times: nothing
-outside and once inside, once where two parts overlap, twice where three do, once where the
-surface is inside out.
+lines 16-18, for any depth). A gap counts w (w - 1) / 2 times: not at all outside and inside one
+solid, once where two overlap or where the surface is inside out, three times where three overlap,
+so that every pair of solids counts once where it overlaps.
 
-That is the sum over the levels l = 2, 3, ... of whether w >= l, and over l = 0, -1, ... of whether
-w < l. So the overlap of a ray is a sum of intervals, one level each, and every crossing whose
-class sign(w_out) is not zero ends exactly one of them. An interval belongs to four sheets: the two
+Crossing a sheet inwards, from w_out to w_out + 1, adds w_out to that. So it is the sum of l - 1
+over the levels l = 2, 3, ... with w >= l, and of 1 - l over l = 0, -1, ... with w < l: the overlap
+of a ray is a sum of intervals, one level each, which count |l - 1| times, and every crossing whose
+w_out = l - 1 is not zero ends exactly one of them. An interval belongs to four sheets: the two
 that bound it, and the two that open and close the solid around it, which bound the interval one
 level down.
 """
@@ -39,16 +40,22 @@ class Overlaps:
         around: the triangles that open and close the solid around it, outside which it has one
             level less; -1 for an interval inside out, which has none.
         barycentric: of the two points where the ray crosses `ends`.
-        class_sign: sign(w_out), the class of both ends: +1 on V_out, -1 on V_in.
-        length: from end to end; the sum times the area of a ray is the overlap volume.
+        outer: w_out at both ends, which is the interval's level less one; its sign is their class,
+            +1 on V_out and -1 on V_in.
+        length: from end to end. The interval counts |w_out| times.
     """
 
     ray: Int[np.ndarray, "N"]
     ends: Int[np.ndarray, "N 2"]
     around: Int[np.ndarray, "N 2"]
     barycentric: Float[np.ndarray, "N 2 3"]
-    class_sign: Int[np.ndarray, "N"]
+    outer: Int[np.ndarray, "N"]
     length: Float[np.ndarray, "N"]
+
+    @property
+    def size(self) -> float:
+        """The lengths, each as often as it counts: times the area of a ray, the overlap volume."""
+        return float((np.abs(self.outer) * self.length).sum())
 
     def only(self, kept: Bool[np.ndarray, "N"]) -> "Overlaps":
         """Some of the intervals."""
@@ -101,7 +108,7 @@ def find_overlaps(
         ends=ends,
         around=_around(level, crossings.face, pair[:, 0], levels),
         barycentric=barycentric.reshape(-1, 2, 3),
-        class_sign=np.sign(levels - 1),
+        outer=levels - 1,
         length=length,
     ).only(kept)
 

@@ -1,21 +1,25 @@
-"""The overlap volume and its gradient in closed form, without rays.
+"""The overlap volume and its gradient in closed form, at any depth.
 
-A triangle's share of the gradient at its corner t is its normal times the integral of c lambda_t
-over it (`overlap.boundary`), and c = sign(w_out) is constant but for jumps of one where other
-triangles pass through. Where |w_out| <= 1, c is w_out itself, so Green's theorem in barycentric
-coordinates (u, v), with dF/du = lambda_t,
+Each pair of solids that overlap in a place counts once there: with the winding number w,
+
+    E = integral of w (w - 1) / 2,
+
+which is 0 outside and inside one solid, 1 where two overlap or the surface is inside out, 3 where
+three overlap. Crossing the surface inwards changes the integrand by c = w_out, so moving it with
+velocity v changes E by the integral of w_out (v . n) over the surface. A triangle's share of the
+gradient at its corner t is its normal times the integral of w_out lambda_t over it, and by Green's
+theorem in barycentric coordinates (u, v), with dF/du = lambda_t,
 
     integral of w lambda_t du dv = sum over the triangle's sides of the integral of w F dv
-                                 + sum over the crossing segments of (w_left - w_right) F dv,
+                                 + sum over the contour's segments of (w_left - w_right) F dv.
 
-needs no subdivision: w along a side is w_out at its end plus a jump wherever the side passes
-through a triangle, and F is quadratic, so Simpson's rule is exact. The volume follows from the
-gradient, because it is homogeneous of degree three: 3 E = sum of (x_t - center) . grad_t E.
+w along a side is that at its start plus a jump wherever the side passes through a triangle, and F
+is quadratic, so Simpson's rule is exact: no subdivision is needed, however many sheets lie over
+each other. The volume follows from the gradient, because it is homogeneous of degree three:
+3 E = sum of (x_t - center) . grad_t E.
 
-Nothing is taken on trust. The same sums with constants in the place of F must be zero on every
-triangle, which they are only if corners, sides and segments fit together, and the gradient of each
-region must sum to zero. Regions where that fails (holes, exact contact), and those deeper than a
-double overlap, are left to the rays.
+The same sums with constants in the place of F vanish on every triangle if corners, sides and
+segments fit together; that they do is checked.
 """
 
 from dataclasses import dataclass
@@ -23,145 +27,124 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.overlap.boundary import area_normals, cross, summed
-from spt_jax.overlap.triangles.segments import Cusps, crossed_triangles, find_segments
-from spt_jax.overlap.triangles.sheets import Sheets
+from spt_jax.overlap.triangles.contours import Contours, senses
+from spt_jax.overlap.triangles.pair_layout import Topology
+from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.winding import Ends
+from spt_jax.overlap.vectors import area_normals, cross, dot, summed
 
 # What the sums with constants, of sides of length one, may leave.
 _GAP = 1e-6
-
-# Sum of a region's gradient, against the sum of its parts' sizes.
-_CLOSED = 1e-6
-
-# Regions compared with all others together.
-_AT_ONCE = 64
 
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # (u, v) of a triangle's corners
 
 
 @dataclass(frozen=True)
-class ClosedForm:
-    """Regions of overlap measured without rays.
+class Shares:
+    """What each triangle contributes.
 
     Attributes:
-        solved: the regions that are; the others have neither volume nor gradient here.
-        volume: of each region.
-        share: integral of c lambda_t over each of `Sheets.faces`, in units of twice its area.
+        faces: the triangles whose surface lies in overlaps, wholly or in part.
+        normals: of these, as long as twice the area.
+        share: the integral of w_out lambda_t over each, in units of twice its area.
+        sound: whether the sums of each triangle close.
     """
 
-    solved: Bool[np.ndarray, "R"]
-    volume: Float[np.ndarray, "R"]
+    faces: Int[np.ndarray, "H"]
+    normals: Float[np.ndarray, "H 3"]
     share: Float[np.ndarray, "H 3"]
+    sound: Bool[np.ndarray, "H"]
+
+    def only(self, kept: Bool[np.ndarray, "H"]) -> "Shares":
+        """Some of the triangles."""
+        return Shares(*(value[kept] for value in vars(self).values()))
+
+    @property
+    def pull(self) -> Float[np.ndarray, "H 3 3"]:
+        """The gradient's parts, by triangle and corner."""
+        return self.share[:, :, None] * self.normals[:, None, :]
 
 
-def solve(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], sheets: Sheets
-) -> ClosedForm:
-    """Volume and gradient of every region of overlap where the closed form applies."""
-    found, corners = sheets.faces, faces[sheets.faces]
+def shares_of(
+    vertices: Float[np.ndarray, "V 3"],
+    topology: Topology,
+    crossings: EdgeCrossings,
+    contours: Contours,
+    ends: Ends,
+    layer: int,
+    times: Int[np.ndarray, "F"] | None = None,
+) -> Shares:
+    """Every triangle's part of the gradient of one layer's volume.
+
+    Args:
+        vertices: positions.
+        topology: of the mesh.
+        crossings, contours: those that count on the layer.
+        ends: the winding numbers.
+        layer: which of them.
+        times: how often each triangle is there, all copies in one place; once if not given. Of
+            copies each next one lies one deeper than the last: what is returned is their mean.
+    """
+    faces = topology.faces
+    within = ends.of_vertices()[:, layer] != 0
+    if not len(contours.pair) and times is None and not within.any():
+        nothing = np.zeros((0, 3))
+        return Shares(np.zeros(0, np.int64), nothing, nothing, np.zeros(0, bool))
+    a, b, c = (within.take(corner) for corner in faces.T)
+    hot = a | b | c
+    hot[contours.pair] = True
+    if times is not None:
+        hot |= times > 1
+    found = np.flatnonzero(hot)
     row = np.full(len(faces), -1)
     row[found] = np.arange(len(found))
+    corners = faces[found]
     normals = area_normals(vertices, corners)
-
-    segments = find_segments(vertices, faces, sheets)
-    # Each segment is a jump on both of its triangles.
-    whole = segments.only(segments.whole)
-    own, foreign = whole.pair.ravel(), whole.pair[:, ::-1].ravel()
-    start, end = (np.repeat(x, 2, axis=0) for x in (whole.start, whole.end))
-    # On the left of the segment, seen against the own normal, is the foreign solid's inside?
-    left = cross(normals[row[own]], end - start)
-    jump = -np.sign(np.einsum("ki,ki->k", left, normals[row[foreign]]))
-    cusps = whole.cusps(faces, row, own, jump)
-    sums, sound, deep = _sides(vertices, faces, sheets, row, cusps)
-    start, end = (
-        _coordinates(vertices, corners[row[own]], normals[row[own]], x) for x in (start, end)
-    )
-    sums += summed(row[own], jump[:, None] * _along(start, end), len(found))
-    deep |= crossed_triangles(row[own], start, end, len(found))
-    sound &= (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
-    sound[row[segments.pair[~segments.whole]]] = False
-
+    sums = _sides(topology, crossings, ends, layer, found, row, times)
+    for own, sign in ((0, 1.0), (1, -1.0)):
+        at = row[contours.pair[:, own]]
+        start, end = (
+            _coordinates(vertices, topology, crossings, contours, own, k, corners[at], normals[at])
+            for k in (0, 1)
+        )
+        steps = sign * _along(start, end)
+        if times is not None:
+            steps *= times[contours.pair[:, 1 - own], None]
+        sums += summed(at, steps, len(found))
+    sound = (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
+    sound[row[contours.pair[~contours.whole]]] = False
     share = sums[:, :3]
-    region = sheets.region[found]
-    fits = np.bincount(region, ~sound, sheets.num_regions) == 0
-    shallow = np.bincount(region, deep, sheets.num_regions) == 0
-    return _volumes(vertices[corners], normals, share, region, fits, shallow)
+    if times is not None:
+        share = share + (times[found, None] - 1) / 12.0  # half of the integral of lambda
+    return Shares(found, normals, share, sound)
 
 
-def gradient(
-    vertices: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    sheets: Sheets,
-    closed: ClosedForm,
-    regions: Bool[np.ndarray, "R"],
-) -> Float[np.ndarray, "V 3"]:
-    """The gradient of the volume of some of the solved regions."""
-    kept = np.flatnonzero(regions[sheets.region[sheets.faces]])
-    corners = faces[sheets.faces[kept]]
-    normals = area_normals(vertices, corners)
-    pull = closed.share[kept][:, :, None] * normals[:, None, :]
-    return summed(corners.ravel(), pull.reshape(-1, 3), len(vertices))
+def _coordinates(vertices, topology, crossings, contours: Contours, own, k, corners, normals):
+    """(u, v), on the first or second triangle of each pair, of the segments' starts or ends."""
+    a, b, c = (vertices[corners[:, j]] for j in range(3))
+    point = contours.point[:, k]
+    square = np.maximum(dot(normals, normals), np.finfo(float).tiny)
+    u = np.clip(dot(normals, cross(point - a, c - a)) / square, 0.0, 1.0)
+    v = np.clip(dot(normals, cross(b - a, point - a)) / square, 0.0, 1.0)
+    over = np.maximum(u + v, 1.0)
+    found = np.stack([u / over, v / over], axis=1)
+    # On its own side a place is known by the part of the edge, whatever the triangle's shape.
+    number = contours.end[:, k]
+    mine = np.flatnonzero((number >= 0) & (contours.owner[:, k] == own))
+    half = contours.half[mine, k]
+    found[mine] = _on_sides(topology, half, crossings.part[number[mine]])
+    cusp = np.flatnonzero(number < 0)
+    turn = np.argmax(corners[cusp] == contours.cusp[cusp, None], axis=1)
+    found[cusp] = _CORNERS[turn]
+    return found
 
 
-def without_entangled(
-    vertices: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    sheets: Sheets,
-    closed: ClosedForm,
-    regions: Bool[np.ndarray, "R"],
-) -> Bool[np.ndarray, "R"]:
-    """Those of some solved regions that share no overlap with one that is left to the rays."""
-    hollow = closed.volume < 0
-    points = vertices[faces[sheets.faces]]
-    return _without_entangled(points, sheets.region[sheets.faces], regions, hollow, hollow)
-
-
-def _volumes(points, normals, share, region, fits, shallow) -> ClosedForm:
-    count = len(fits)
-    faces_in = np.maximum(np.bincount(region, minlength=count), 1)
-    center = summed(region, points.mean(axis=1), count) / faces_in[:, None]
-    pull = share[:, :, None] * normals[:, None, :]
-    arm = points - center[region][:, None, :]
-    volume = np.bincount(region, np.einsum("kci,kci->k", arm, pull), count) / 3
-    size = np.bincount(region, np.abs(pull).sum(axis=(1, 2)), count)
-    total = np.abs(summed(region, pull.sum(axis=1), count))
-    fits = fits & (total <= _CLOSED * size[:, None]).all(axis=1)
-    solved = _without_entangled(points, region, fits & shallow, (volume < 0) | ~fits, volume < 0)
-    return ClosedForm(solved, np.where(solved, volume, 0.0), share)
-
-
-def _without_entangled(points, region, solved, may_be_hollow, hollow) -> Bool[np.ndarray, "R"]:
-    """The solved regions that share no overlap with one that is not.
-
-    A cavity in an overlap is a region of its own, with a negative volume. Rays see the two at once:
-    an interval ends at the one and at the other, so both or neither must be left to them.
-    """
-    if solved.all() or not solved.any():
-        return solved
-    low = np.full((len(solved), 3), np.inf)
-    np.minimum.at(low, region, points.min(axis=1))
-    high = np.full((len(solved), 3), -np.inf)
-    np.maximum.at(high, region, points.max(axis=1))
-    solved = solved.copy()
-    left = np.flatnonzero(~solved)
-    while len(left):
-        now, left = left[:_AT_ONCE], left[_AT_ONCE:]
-        around = (low <= low[now, None]).all(axis=2) & (high >= high[now, None]).all(axis=2)
-        within = (low >= low[now, None]).all(axis=2) & (high <= high[now, None]).all(axis=2)
-        entangled = (around & may_be_hollow[now, None]) | (within & hollow)
-        more = np.flatnonzero(solved & entangled.any(axis=0))
-        solved[more] = False
-        left = np.concatenate([left, more])
-    return solved
-
-
-def _coordinates(vertices, corners, normals, point) -> Float[np.ndarray, "K 2"]:
-    """(u, v) of points on triangles: their barycentric coordinates at corners 1 and 2."""
-    a, b, c = (vertices[corners[:, k]] for k in range(3))
-    square = np.maximum(np.einsum("ki,ki->k", normals, normals), np.finfo(float).tiny)
-    u = np.einsum("ki,ki->k", normals, cross(point - a, c - a)) / square
-    v = np.einsum("ki,ki->k", normals, cross(b - a, point - a)) / square
-    return np.stack([u, v], axis=1)
+def _on_sides(topology: Topology, half, part) -> Float[np.ndarray, "K 2"]:
+    """(u, v) of places on half-edges, given what part of the edge lies before them."""
+    part = np.where(senses(topology, half) > 0, part, 1 - part)
+    turn = half % 3
+    start, end = _CORNERS[(turn + 1) % 3], _CORNERS[(turn + 2) % 3]
+    return start + part[:, None] * (end - start)
 
 
 def _along(start, end) -> Float[np.ndarray, "K 5"]:
@@ -173,84 +156,68 @@ def _along(start, end) -> Float[np.ndarray, "K 5"]:
     return np.concatenate([integrals, step], axis=1)
 
 
-def _sides(vertices, faces, sheets: Sheets, row, cusps: Cusps):
-    """The sides' part of all sums; where they are known; which triangles lie deeper than w = 1."""
-    corners = faces[sheets.faces]
-    count = len(corners)
-    start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    side_start = np.tile(_CORNERS, (count, 1))
-    side_end = np.tile(np.roll(_CORNERS, -1, axis=0), (count, 1))
+_SIDES = _along(_CORNERS, np.roll(_CORNERS, -1, axis=0))
+
+
+def _sides(topology: Topology, crossings: EdgeCrossings, ends: Ends, layer, found, row, times):
+    """The sides' part of all sums."""
+    corners = topology.faces[found]
+    count = len(found)
+    begins = ends.of_vertices()[:, layer][corners].astype(np.float64)
+    cusped = np.flatnonzero(ends.cusp[corners])
+    if len(cusped):
+        face, turn = np.divmod(cusped, 3)
+        there = topology.row[3 * found[face] + (turn + 2) % 3]
+        end = (topology.ends[there, 1] == corners[face, turn]).astype(np.int64)
+        begins[face, turn] = ends.of_ends(topology, there, end)[:, layer]
+    sums = begins @ _SIDES
 
     # Each edge that passes through a triangle is a side of two others.
-    crossings = sheets.crossings
-    face = crossings.edge_faces.T.ravel()
-    kept = np.flatnonzero(face >= 0)
-    face, piercing = face[kept], np.tile(np.arange(len(crossings.face)), 2)[kept]
-    low, high = crossings.edge[piercing].T
-    own = faces[face]
-    first = np.argmax((own == low[:, None]) | (own == high[:, None]), axis=1)
-    wraps = (first == 0) & (own[:, 1] != low) & (own[:, 1] != high)
-    side = 3 * row[face] + np.where(wraps, 2, first)
-    forward = start[side] == low
-    along = vertices[high] - vertices[low]
-    through = area_normals(vertices, faces[crossings.face[piercing]])
-    # Going along a side into a solid raises the winding number by one.
-    jump = -np.sign(np.einsum("ki,ki->k", along, through)) * np.where(forward, 1.0, -1.0)
-    length = np.maximum(np.einsum("ki,ki->k", along, along), np.finfo(float).tiny)
-    part = np.einsum("ki,ki->k", crossings.point[piercing] - vertices[low], along) / length
-    part = np.clip(np.where(forward, part, 1 - part), 0.0, 1.0)
-
-    begins, known = _at_starts(start, end, np.bincount(side, jump, len(start)), sheets, cusps)
-    at = side_start[side] + part[:, None] * (side_end - side_start)[side]
-    sums = begins[:, None] * _along(side_start, side_end)
-    sums += summed(side, jump[:, None] * _along(at, side_end[side]), len(start))
-    sums = sums.reshape(count, 3, 5).sum(axis=1)
-
-    # The winding number after each jump; before the first it is that of the corner.
-    order = np.lexsort((part, side))
-    run = np.cumsum(jump[order])
-    new = np.concatenate([[True], np.diff(side[order]) > 0])[: len(order)]
-    before = np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))
-    after = begins[side[order]] + run - (run[before] - jump[order][before])
-    deep = np.bincount(side[order][np.abs(after) > 1] // 3, minlength=count) > 0
-    deep |= (np.abs(begins) > 1).reshape(count, 3).any(axis=1)
-    return sums, known.reshape(count, 3).all(axis=1), deep
+    number = np.tile(np.arange(len(crossings.face)), 2)
+    half = topology.halves[crossings.row].T.ravel()
+    kept = np.flatnonzero(half >= 0)
+    number, half = number[kept], half[kept]
+    jump = crossings.jump[number] * senses(topology, half)
+    if times is not None:
+        jump = jump * times[crossings.face[number]]
+    at = _on_sides(topology, half, crossings.part[number])
+    rest = _along(at, _CORNERS[(half % 3 + 2) % 3])
+    return sums + summed(row[half // 3], jump[:, None] * rest, count)
 
 
-def _at_starts(start, end, total_jump, sheets: Sheets, cusps: Cusps):
-    """The winding number on the outer side at the start of each side, and where it is known.
+def volumes_of(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    shares: Shares,
+    region: Int[np.ndarray, "H"],
+    count: int,
+    times: Int[np.ndarray, "F"] | None = None,
+) -> Float[np.ndarray, "R"]:
+    """The volume of each region, from the gradients of its triangles.
 
-    It is the corner's, or that of the side's other end without the jumps between. At a cusp a
-    corner has one number for each of its sides; there it comes from the side before or after, over
-    the segments that end in the corner, or from the triangle on the other side of the edge.
+    Args:
+        vertices, faces: the mesh.
+        shares: what the triangles contribute.
+        region: of each of these triangles, from 0 to `count` - 1.
+        count: how many regions there are.
+        times: how often each triangle is there.
     """
-    trusted = np.ones(len(sheets.winding), bool)
-    trusted[cusps.vertices] = False
-    begins = np.where(trusted[start], sheets.winding[start], sheets.winding[end] - total_jump)
-    known = trusted[start] | trusted[end]
-    sides = np.arange(len(start)).reshape(-1, 3)
-    before, after = (np.roll(sides, shift, axis=1).ravel() for shift in (1, -1))
-    for _ in range(2):
-        for other, value in (
-            (before, begins[before] + total_jump[before] - cusps.jump),
-            (after, begins[after] + cusps.jump[after] - total_jump),
-        ):
-            begins = np.where(known, begins, value)
-            known = known | known[other]
-        if known.all():
-            break
-        _ask_neighbours(start, end, begins, total_jump, known)
-    return begins, known
+    points = vertices[faces[shares.faces]]
+    size = np.maximum(np.bincount(region, minlength=count), 1)
+    center = summed(region, points.mean(axis=1), count) / size[:, None]
+    arm = points - center[region][:, None, :]
+    parts = np.einsum("kci,kci->k", arm, shares.pull)
+    if times is not None:
+        parts *= times[shares.faces]
+    return np.bincount(region, parts, count) / 3
 
 
-def _ask_neighbours(start, end, begins, total_jump, known) -> None:
-    lost = np.flatnonzero(~known)
-    size = max(start.max(), end.max()) + 1
-    order = np.argsort(start * size + end)
-    reverse = end[lost] * size + start[lost]
-    at = np.searchsorted((start * size + end)[order], reverse)
-    twin = order[np.minimum(at, len(order) - 1)]
-    there = (start[twin] == end[lost]) & (end[twin] == start[lost])
-    # A neighbour that is in no overlap is not among the sides: nothing overlaps along the edge.
-    begins[lost] = np.where(there, begins[twin] + total_jump[twin], 0.0)
-    known[lost] = ~there | known[twin]
+def gradient_of(
+    faces: Int[np.ndarray, "F 3"],
+    shares: Shares,
+    weight: Float[np.ndarray, "H"] | None,
+    count: int,
+) -> Float[np.ndarray, "V 3"]:
+    """The sum of the triangles' gradients, each with a weight, at `count` vertices."""
+    pull = shares.pull if weight is None else weight[:, None, None] * shares.pull
+    return summed(faces[shares.faces].ravel(), pull.reshape(-1, 3), count)

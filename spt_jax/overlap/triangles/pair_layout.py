@@ -8,6 +8,8 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.triangles.manifold import matched_half_edges
+
 # Triangles to a cluster, and clusters to a group. On the posed body 4 make 33,000 pairs of clusters
 # that meet, 16 make 300,000 pairs of triangles in them to look at; 8 make 16,000 and 210,000.
 CLUSTER = 8
@@ -27,13 +29,14 @@ class Topology:
         end_key: the same as single numbers, lower * V + higher, which ascend.
         edge_faces: the two triangles of each edge, or -1. An edge of more than two triangles has
             a row here and in `ends` for every two of them.
+        halves: the half-edges of each row, or -1; 3 face + k is opposite to corner k.
+        row: of each half-edge.
         edge_id: a number for each row, the same for the rows of one edge.
         opposite: for each corner of a face, the row of the edge opposite to it if this face is
             the first of that row, else -1: every row is tested once, from its first face.
         closed: vertices whose triangles surround them: each edge there has two triangles,
             which run along it in opposite senses.
         used: vertices of any triangle.
-        simple: vertices whose triangles hang together by edges there, not in several fans.
         neighbours: (V, V), has an entry for each edge in both directions.
         entries: the places of each row's two directions in its data and indices.
         starts: a vertex of each connected part, of the largest few.
@@ -45,11 +48,12 @@ class Topology:
     ends: Int[np.ndarray, "R 2"]
     end_key: Int[np.ndarray, "R"]
     edge_faces: Int[np.ndarray, "R 2"]
+    halves: Int[np.ndarray, "R 2"]
+    row: Int[np.ndarray, "F3"]
     edge_id: Int[np.ndarray, "R"]
     opposite: Int[np.ndarray, "F 3"]
     closed: Bool[np.ndarray, "V"]
     used: Bool[np.ndarray, "V"]
-    simple: Bool[np.ndarray, "V"]
     neighbours: "scipy.sparse.csr_array"
     entries: Int[np.ndarray, "R 2"]
     starts: Int[np.ndarray, "P"]
@@ -129,27 +133,22 @@ def prepared(faces: Int[np.ndarray, "F 3"], count: int) -> Prepared:
 def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     tail, head = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
     low, high = np.minimum(tail, head), np.maximum(tail, head)
-    half = np.lexsort((high, low))  # half-edge 3 face + k is opposite to corner k
-    low, high = low[half], high[half]
-    new = np.append(True, (low[1:] != low[:-1]) | (high[1:] != high[:-1]))
-    place = np.arange(len(half))
-    rank = place - np.maximum.accumulate(np.where(new, place, 0))
-    first = np.flatnonzero(rank % 2 == 0)
-    second = np.minimum(first + 1, len(half) - 1)
-    paired = (rank[second] % 2 == 1) & (first + 1 < len(half))
+    first, second, matched = _rows(faces, low, high)
+    order = np.lexsort((first, high[first], low[first]))
+    first, second, matched = first[order], second[order], matched[order]
     opposite = np.full(faces.size, -1)
-    opposite[half[first]] = np.arange(len(first))
+    opposite[first] = np.arange(len(first))
+    row = opposite.copy()
+    row[second[second >= 0]] = np.flatnonzero(second >= 0)
 
-    edge_id = np.cumsum(new) - 1
-    use = np.bincount(edge_id)
-    sense = np.bincount(edge_id, np.where(tail < head, 1, -1)[half])
-    ragged = ((use != 2) | (sense != 0))[edge_id]
     used = np.bincount(faces.ravel(), minlength=count) > 0
     closed = used.copy()
-    closed[low[ragged]] = False
-    closed[high[ragged]] = False
-    fan = np.argsort(faces.ravel(), kind="stable")
     ends = np.stack([low[first], high[first]], axis=1)
+    new = np.diff(ends, axis=0).any(axis=1)
+    edge_id = np.concatenate([[0], np.cumsum(new)])[: len(first)]
+    ragged = ~matched | (np.bincount(edge_id)[edge_id] > 1)
+    closed[ends[ragged]] = False
+    fan = np.argsort(faces.ravel(), kind="stable")
     tail, head = np.concatenate([ends, ends[:, ::-1]]).T
     order = np.lexsort((head, tail))
     entries = np.empty(len(order), np.int64)
@@ -162,12 +161,13 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
         faces=faces,
         ends=ends,
         end_key=ends @ np.array([count, 1]),
-        edge_faces=np.stack([half[first] // 3, np.where(paired, half[second] // 3, -1)], axis=1),
-        edge_id=edge_id[first],
+        edge_faces=np.stack([first // 3, np.where(second >= 0, second // 3, -1)], axis=1),
+        halves=np.stack([first, second], axis=1),
+        row=row,
+        edge_id=edge_id,
         opposite=opposite.reshape(faces.shape),
         closed=closed,
         used=used,
-        simple=_simple(faces, half[first[paired]], half[second[paired]], count),
         neighbours=neighbours,
         entries=entries.reshape(2, -1).T,
         starts=_starts(neighbours),
@@ -176,31 +176,27 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     )
 
 
+def _rows(faces, low, high):
+    """The half-edges of each row, -1 where it has one only, and whether they run against it."""
+    pairs, left = matched_half_edges(faces)
+    # Two that run in the same sense are put together, too.
+    left = left[np.lexsort((left, high[left], low[left]))]
+    new = np.concatenate([[True], (np.diff(low[left]) != 0) | (np.diff(high[left]) != 0)])
+    place = np.arange(len(left))
+    rank = place - np.maximum.accumulate(np.where(new[: len(left)], place, 0))
+    lead = np.flatnonzero(rank % 2 == 0)
+    mate = np.minimum(lead + 1, max(len(left) - 1, 0))
+    mated = (rank[mate] % 2 == 1) & (lead + 1 < len(left))
+    first = np.concatenate([pairs.min(axis=0), left[lead]])
+    second = np.concatenate([pairs.max(axis=0), np.where(mated, left[mate], -1)])
+    return first, second, np.arange(len(first)) < pairs.shape[1]
+
+
 def _starts(neighbours) -> Int[np.ndarray, "P"]:
     part = scipy.sparse.csgraph.connected_components(neighbours, directed=False)[1]
     vertex = np.zeros(part.max(initial=-1) + 1, np.int64)
     vertex[part] = np.arange(len(part))
     return vertex[np.argsort(-np.bincount(part), kind="stable")[:_MOST_STARTS]]
-
-
-def _simple(faces, one, other, count: int) -> Bool[np.ndarray, "V"]:
-    """Vertices whose corners are connected over edges, given the two half-edges of each."""
-    links = []
-    for turn in (1, 2):
-        # Half-edge 3 face + k has its ends in the corners k + 1 and k + 2, in one face in this
-        # order and in the other face against it.
-        (a, k), (b, m) = np.divmod(one, 3), np.divmod(other, 3)
-        corner = 3 * a + (k + turn) % 3
-        there = np.where(faces[b, (m + 1) % 3] == faces[a, (k + turn) % 3], 1, 2)
-        links.append(np.stack([corner, 3 * b + (m + there) % 3]))
-    first, second = np.concatenate(links, axis=1)
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(first), np.int8), (first, second)), shape=(faces.size, faces.size)
-    )
-    fan = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    vertex = np.empty(fan.max(initial=-1) + 1, np.int64)
-    vertex[fan] = faces.ravel()
-    return np.bincount(vertex, minlength=count) <= 1
 
 
 def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layout:

@@ -1,4 +1,4 @@
-"""Pairs of triangles against each other's planes: which may cross, and which touch."""
+"""Pairs of triangles against each other's planes: which may intersect, and which touch."""
 
 import numpy as np
 
@@ -7,43 +7,44 @@ from spt_jax.overlap.triangles.pair_layout import Layout
 
 # Relative to the size of what is multiplied, far above float64's rounding.
 ROUNDING = 1e-14
-# A vertex beside a triangle by less than this part of its size, in the same plane, is on it.
-_BESIDE = 1e-3
-# Nearer than this part of the mesh's longest side is on the same spot, as `_THINNEST` in
-# `vertex_winding.py`: no screen shows the mesh larger by more than the root of three.
-_CONTACT = 2e-7
+_NO_CONTACT = np.zeros((2, 0), np.int64)
 
 
-def not_apart(layout: Layout, shape: Shape, t, u):
-    """The pairs that neither's plane keeps apart, and vertices that lie on the other triangle."""
+def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
+    """The pairs that neither's plane keeps apart; and vertices that lie on the other triangle.
+
+    Args:
+        reach: how near to a triangle a vertex lies on it.
+    """
     contacts = []
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         height, margin = _heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
-        reach = _CONTACT * shape.span * shape.length.take(y)
-        np.maximum(margin, reach, out=margin)
+        near = reach * shape.length.take(y)
+        np.maximum(margin, near, out=margin)
         kept = np.flatnonzero((height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin))
-        height, reach = height.take(kept, axis=1), reach.take(kept)
-        near = np.flatnonzero(np.abs(height).min(axis=0) <= reach)
-        if len(near):
-            x, y = x[kept[near]], y[kept[near]]
-            contacts.append(_contacts(layout, shape, x, y, reach[near]))
+        height, near = height.take(kept, axis=1), near.take(kept)
+        on = np.flatnonzero(np.abs(height).min(axis=0) <= near)
+        if len(on):
+            contacts.append(_contacts(layout, shape, x[kept[on]], y[kept[on]], reach))
         t, u = t[kept], u[kept]
-    return t, u, np.concatenate(contacts) if contacts else np.zeros(0, np.int64)
+    vertex, face = (np.concatenate(x) for x in zip(_NO_CONTACT, *contacts, strict=True))
+    return t, u, vertex, face
 
 
-def _contacts(layout: Layout, shape: Shape, x, y, reach):
-    """The corners of triangles x that lie on triangles y, not only in the same plane."""
+def _contacts(layout: Layout, shape: Shape, x, y, reach: float):
+    """The corners of triangles x that lie on triangles y: vertices and faces."""
     points, normal = shape.corner.take(x, axis=2), shape.normal.take(y, axis=1)
-    on = np.abs(_heights(shape, points, shape.extent.take(x), y)[0]) <= reach
+    length, sense = shape.length.take(y), layout.sense.take(y)
+    on = np.abs(_heights(shape, points, shape.extent.take(x), y)[0]) <= reach * length
+    on &= length > 0
     a, b, c = shape.corner.take(y, axis=2).transpose(1, 0, 2)
-    sense, square = layout.sense.take(y), dot(normal, normal)
     for start, end in ((a, b), (b, c), (c, a)):
-        along = cross(normal, end - start) * sense
-        inward = dot(along[:, None], points - start[:, None])
-        on &= inward >= -_BESIDE * square
+        side = end - start
+        inward = _dot(cross(normal, side)[:, None] * sense, points - start[:, None])
+        on &= inward >= -reach * length * np.sqrt(_dot(side, side))
     corner, pair = np.nonzero(on)
-    return layout.corners[corner, x[pair]]
+    return layout.corners[corner, x[pair]], layout.face[y[pair]]
 
 
 def straddles(shape: Shape, points, extent, slot):
@@ -62,6 +63,5 @@ def _heights(shape: Shape, points, extent, slot):
     return height, ROUNDING * own * own * (own + extent)
 
 
-def dot(x, y):
-    """Dot products of the columns."""
+def _dot(x, y):
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]

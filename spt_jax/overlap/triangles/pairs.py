@@ -4,10 +4,10 @@ Triangles that share a vertex are told apart by that vertex: if the triangles ar
 along some direction, lie side by side, none of them meets another. That holds nearly everywhere,
 and is proved for all vertices at once; only where it is not are these pairs examined. Triangles
 that share no vertex are found by boxes: of clusters of neighbours, then of the triangles in them.
-What is left is decided by signed volumes.
+What is left is decided by the signs of volumes, which are exact (`predicates.py`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,14 +15,14 @@ from jaxtyping import Bool, Float, Int
 from spt_jax.overlap.triangles.pair_boxes import (
     Shape,
     concatenate,
-    cross,
     near_groups,
     near_pairs,
     parts,
     spread,
 )
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
-from spt_jax.overlap.triangles.pair_planes import ROUNDING, dot, not_apart, straddles
+from spt_jax.overlap.triangles.pair_planes import ROUNDING, not_apart, straddles
+from spt_jax.overlap.triangles.predicates import Predicates
 
 # Pairs of triangles that no plane of theirs parts. More of them are noise, and would take all the
 # memory there is: a body of 24,540 triangles has 1,800, with joints turned by 2 rad at random
@@ -42,16 +42,41 @@ class EdgeCrossings:
         edge: vertices of the edge, the lower first.
         edge_faces: the two triangles of the edge; -1 where it has one only. An edge of more than
             two triangles is listed once for every two of them.
+        row: of the edge, in the mesh's topology.
         face: the triangle that the edge passes through.
-        point: where it does.
-        touching: vertices that lie on a triangle which is not theirs, but for rounding.
+        part: of the edge's length, from the lower vertex, where it does.
+        point: the place itself.
+        jump: by how much the winding number rises along the edge: +1 where it enters, -1 where it
+            leaves the solid that the triangle bounds.
     """
 
     edge: Int[np.ndarray, "K 2"]
     edge_faces: Int[np.ndarray, "K 2"]
+    row: Int[np.ndarray, "K"]
     face: Int[np.ndarray, "K"]
+    part: Float[np.ndarray, "K"]
     point: Float[np.ndarray, "K 3"]
-    touching: Int[np.ndarray, "T"]
+    jump: Int[np.ndarray, "K"]
+
+    def only(self, kept: Bool[np.ndarray, "K"]) -> "EdgeCrossings":
+        """Some of the crossings."""
+        return replace(self, **{name: value[kept] for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Vertices that lie on triangles which are not theirs, but for rounding.
+
+    Attributes:
+        vertex, face: the two.
+    """
+
+    vertex: Int[np.ndarray, "T"]
+    face: Int[np.ndarray, "T"]
+
+    def only(self, kept: Bool[np.ndarray, "T"]) -> "Contacts":
+        """Some of the contacts."""
+        return replace(self, **{name: value[kept] for name, value in vars(self).items()})
 
 
 def edge_crossings(
@@ -63,10 +88,11 @@ def edge_crossings(
     """Every edge that passes through a triangle with which it shares no vertex.
 
     Edge pq passes through triangle abc where the tetrahedra pabc and qabc have opposite signed
-    volumes and pqab, pqbc and pqca have one sign. A volume of exactly zero counts as positive,
-    in an order of the vertices that does not depend on the triangle. So where an edge meets the
-    common edge of two triangles that lie side by side, it passes through exactly one of them;
-    and through triangles without area, or in its own plane, no edge passes.
+    volumes and pqab, pqbc and pqca have one sign. The signs are exact, and those of volumes that
+    are exactly zero are decided as `predicates.py` says: the crossings are those of a surface in
+    general position, which differs from the one given by less than any number. So two triangles
+    always cross along a segment that has two ends; whether they only touch, `Contours.proper`
+    tells.
 
     Args:
         vertices: positions, in any unit.
@@ -93,20 +119,40 @@ def edge_crossings(
         >>> print(found.edge.tolist(), found.face, found.point.tolist())
         [[3, 4], [3, 5]] [0 0] [[1.0, 1.0, 0.0], [1.5, 1.0, 0.0]]
     """
+    return find_intersections(vertices, faces, among=among)[0]
+
+
+def find_intersections(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    *,
+    among: Bool[np.ndarray, "F"] | None = None,
+    predicates: Predicates | None = None,
+    reach: float = 0.0,
+) -> tuple[EdgeCrossings, Contacts]:
+    """`edge_crossings`, and the vertices that lie on other triangles.
+
+    Args:
+        vertices, faces, among: as there.
+        predicates: the signs, where they are needed for more.
+        reach: how near to a triangle a vertex lies on it, against the largest coordinate.
+    """
     nothing = np.zeros(0, np.int64)
+    untouched = Contacts(nothing, nothing)
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        pairs = np.zeros((0, 2), np.int64)
-        return EdgeCrossings(pairs, pairs, nothing, np.zeros((0, 3)), nothing)
+        pairs, places = np.zeros((0, 2), np.int64), np.zeros((0, 3))
+        none = EdgeCrossings(pairs, pairs, nothing, nothing, np.zeros(0), places, nothing)
+        return none, untouched
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise IndexError(
             f"faces must index into vertices: got indices {faces.min()} to {faces.max()} for "
             f"{len(vertices)} vertices; indices are 0-based."
         )
-    # A power of two, so that nothing is rounded: products of three lengths stay in range.
-    _, exponent = np.frexp(np.abs(vertices).max())
-    points = np.ldexp(vertices.T.astype(np.float64, order="C"), -int(exponent))
+    if predicates is None:
+        predicates = Predicates(vertices, faces)
+    points = predicates.points
     if not np.ptp(points, axis=1).any():
-        return edge_crossings(vertices, faces[:0])
+        return find_intersections(vertices, faces[:0])
     mesh = prepared(faces, len(vertices))
     topology = mesh.topology
     touching = None if among is None else _touching(topology, among)
@@ -114,7 +160,8 @@ def edge_crossings(
     found = list(_around_vertices(points, topology, layout, shape))
     contacts, seen, most = [], 0, _MOST_PAIRS + _MOST_PAIRS_EACH * len(faces)
     for t, u in near_pairs(layout, shape, clusters, groups, touching):
-        t, u, contact = not_apart(layout, shape, t, u)
+        t, u, *contact = not_apart(layout, shape, t, u, reach)
+        contacts.append(contact)
         seen += len(t)
         if seen > most:
             raise Entangled(
@@ -122,20 +169,24 @@ def edge_crossings(
                 f"{most:,} pairs of {len(faces):,} triangles that are near each other; look for "
                 "coordinates that exploded or collapsed."
             )
-        contacts.append(contact)
-        found.append(_edges_of_pairs(topology, layout, t, u))
+        found.append(_edges_of_pairs(topology, layout, *_straddling(predicates, layout, t, u)))
     row, slot = concatenate(found) if found else (nothing, nothing)
-    row, face, part = _decide(points, topology, layout, row, slot)
     if among is not None:
-        kept = _edges_of(topology, among)[topology.edge_id[row]] | among[face]
-        row, face, part = row[kept], face[kept], part[kept]
+        kept = _edges_of(topology, among)[topology.edge_id[row]] | among[layout.face[slot]]
+        row, slot = row[kept], slot[kept]
+    row, slot, part, jump = _decide(predicates, topology, layout, row, slot)
+    face = layout.face[slot]
     order = np.lexsort((face, row))
-    row, face, part = row[order], face[order], part[order]
+    row, face, part, jump = row[order], face[order], part[order], jump[order]
     ends = topology.ends[row]
     p, q = np.float64(vertices[ends[:, 0]]), np.float64(vertices[ends[:, 1]])
     point = p + part[:, None] * (q - p)
-    contacts = np.unique(np.concatenate(contacts)) if contacts else nothing
-    return EdgeCrossings(ends, topology.edge_faces[row], face, point, contacts)
+    found = EdgeCrossings(ends, topology.edge_faces[row], row, face, part, point, jump)
+    if not contacts:
+        return found, untouched
+    vertex, face = np.concatenate(contacts, axis=1)
+    # As single numbers they sort ten times as fast as by rows.
+    return found, Contacts(*np.divmod(np.unique(vertex * len(faces) + face), len(faces)))
 
 
 def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
@@ -246,6 +297,17 @@ def _medians(x, layout: Layout, count):
     return np.bincount(median, minlength=count + 1)[:-1]
 
 
+def _straddling(predicates: Predicates, layout: Layout, t, u):
+    """The pairs of triangles each of which has corners on both sides of the other's plane."""
+    for turn in (0, 1):
+        x, y = (t, u) if turn else (u, t)
+        plane, corner = layout.corners.take(y, axis=1), layout.corners.take(x, axis=1)
+        side, _ = predicates.volume(*np.tile(plane, 3), corner.ravel())
+        kept = np.flatnonzero(np.abs(side.reshape(3, -1).sum(axis=0)) < 3)
+        t, u = t[kept], u[kept]
+    return t, u
+
+
 def _edges_of_pairs(topology: Topology, layout: Layout, t, u):
     """Candidates (row, slot) of pairs of triangles."""
     row = topology.opposite.take(layout.face[np.concatenate([t, u])], axis=0).ravel()
@@ -254,26 +316,17 @@ def _edges_of_pairs(topology: Topology, layout: Layout, t, u):
     return row[kept], slot[kept]
 
 
-def _decide(points, topology: Topology, layout: Layout, row, slot):
-    """The candidates that cross, and what part of the edge lies before the crossing.
-
-    Every sign is computed from the same numbers in the same order for all who ask for it: on
-    which side of a triangle a vertex lies, and on which side of each other two edges pass. So an
-    edge that leaves one triangle for the next across their common edge passes through exactly
-    one of them, whatever the rounding; touching counts as lying on the positive side.
-    """
-    corner = layout.corners.take(slot, axis=1)
-    ends = topology.ends.take(row, axis=0).T
-    a, b, c = (points.take(x, axis=1) for x in corner)
-    p, q = (points.take(x, axis=1) for x in ends)
-    normal = cross(b - a, c - a)
-    of_p, of_q = dot(normal, p - a), dot(normal, q - a)
-    kept = np.flatnonzero((of_p >= 0) != (of_q >= 0))
-    row, slot, of_p, of_q = row[kept], slot[kept], of_p[kept], of_q[kept]
-    a, b, c, p, q = (x.take(kept, axis=1) for x in (a, b, c, p, q))
-    along, to_a, to_b, to_c = q - p, a - p, b - p, c - p
-    of_a, of_b = cross(along, to_a), cross(along, to_b)
-    first, second, third = dot(of_a, to_b) >= 0, dot(of_b, to_c) >= 0, dot(of_a, to_c) >= 0
-    kept = np.flatnonzero((first == second) & (first != third))
-    of_p, of_q = of_p[kept], of_q[kept]
-    return row[kept], layout.face[slot[kept]], of_p / (of_p - of_q)
+def _decide(predicates: Predicates, topology: Topology, layout: Layout, row, slot):
+    """The candidates that cross, what part of the edge lies before the crossing, and the jump."""
+    corners, ends = layout.corners.take(slot, axis=1), topology.ends.take(row, axis=0).T
+    side, height = (x.reshape(2, -1) for x in predicates.volume(*np.tile(corners, 2), ends.ravel()))
+    kept = np.flatnonzero(side[0] != side[1])
+    row, slot, side, height = row[kept], slot[kept], side[0, kept], height[:, kept]
+    corners, ends = corners[:, kept], ends[:, kept]
+    # The edge passes on one side of all three of the triangle's.
+    start, end = corners.ravel(), corners[[1, 2, 0]].ravel()
+    turn, _ = predicates.volume(*np.tile(ends, 3), start, end)
+    kept = np.flatnonzero(np.abs(turn.reshape(3, -1).sum(axis=0)) == 3)
+    part = predicates.part_before(*corners[:, kept], *ends[:, kept], np.abs(height[:, kept]))
+    jump = side[kept] * layout.sense[slot[kept]].astype(np.int64)
+    return row[kept], slot[kept], part, jump

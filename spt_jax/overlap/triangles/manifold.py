@@ -1,0 +1,283 @@
+"""A surface as the exact method wants it: closed, and with one sheet at every vertex.
+
+Winding numbers depend on where the triangles are and not on how their corners are named. So any
+list of triangles is rewritten, without moving one: edges of more than two triangles are shared by
+two at a time, vertices at which several sheets meet become one vertex each, and what is missing
+along boundary loops is filled by fans. Triangles that list a vertex twice have no area and go.
+"""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy
+from jaxtyping import Float, Int
+
+from spt_jax.overlap.vectors import summed
+
+_KEPT = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Manifold:
+    """The rewritten faces, and where their vertices come from.
+
+    Attributes:
+        given: the faces that were rewritten.
+        faces: of the new vertices; first those that were given, in their order, then the fans.
+        kept: for each of these the number of the face given; -1 in fans.
+        beside: the same, but for a fan's triangle the face at the edge that it closes.
+        origin: the given vertex at which each new one is; those after `count` are fans' centers.
+        loops: of each boundary loop, the given vertices along it.
+        part: the number of each new vertex's connected part.
+        num_parts: how many parts there are.
+        is_given: whether nothing had to be rewritten.
+    """
+
+    given: Int[np.ndarray, "F 3"]
+    faces: Int[np.ndarray, "G 3"]
+    kept: Int[np.ndarray, "G"]
+    beside: Int[np.ndarray, "G"]
+    origin: Int[np.ndarray, "W"]
+    loops: tuple[Int[np.ndarray, "_"], ...]
+    part: Int[np.ndarray, "X"]
+    num_parts: int
+    is_given: bool
+
+    @property
+    def num_fan_faces(self) -> int:
+        """Triangles that fill boundary loops."""
+        return int(np.count_nonzero(self.kept < 0))
+
+    @cached_property
+    def _by_part(self) -> tuple[Int[np.ndarray, "X"], Int[np.ndarray, "P1"]]:
+        """The vertices part by part, and where each part begins."""
+        order = np.argsort(self.part, kind="stable")
+        return order, np.append(0, np.cumsum(np.bincount(self.part, minlength=self.num_parts)))
+
+    @cached_property
+    def _faces_by_part(self) -> tuple[Int[np.ndarray, "G"], Int[np.ndarray, "P1"]]:
+        part = self.part[self.faces[:, 0]]
+        order = np.argsort(part, kind="stable")
+        return order, np.append(0, np.cumsum(np.bincount(part, minlength=self.num_parts)))
+
+    def copies(self, placed: Float[np.ndarray, "X 3"]) -> Int[np.ndarray, "P"]:
+        """For each part the first one that lies where it does, vertex on vertex."""
+        first = np.arange(self.num_parts)
+        (vertex, begin), (face, start) = self._by_part, self._faces_by_part
+        size = np.stack([np.diff(begin), np.diff(start)], axis=1)
+        solid = np.flatnonzero(size[:, 1])
+        key = np.concatenate([placed[vertex[begin[solid]]], size[solid]], axis=1)
+        order = np.lexsort(key.T)
+        alike = (key[order[1:]] == key[order[:-1]]).all(axis=1)
+        if not alike.any():
+            return first
+        run = np.concatenate([[0], np.cumsum(~alike)])
+        for group in np.split(solid[order], np.flatnonzero(np.diff(run)) + 1):
+            leaders: list[int] = []
+            for part in np.sort(group).tolist():
+                own = vertex[begin[part] : begin[part + 1]]
+                corners = np.searchsorted(own, self.faces[face[start[part] : start[part + 1]]])
+                for leader in leaders:
+                    there = vertex[begin[leader] : begin[leader + 1]]
+                    faces = self.faces[face[start[leader] : start[leader + 1]]]
+                    same = np.array_equal(placed[own], placed[there])
+                    if same and np.array_equal(corners, np.searchsorted(there, faces)):
+                        first[part] = leader
+                        break
+                else:
+                    leaders.append(part)
+        return first
+
+    def without(
+        self, first: Int[np.ndarray, "P"]
+    ) -> tuple["Manifold", Int[np.ndarray, "C"], Int[np.ndarray, "C"]]:
+        """The surface without copies, the copies' vertices, and what each is a copy of."""
+        kept = np.flatnonzero(first[self.part[self.faces[:, 0]]] == self.part[self.faces[:, 0]])
+        vertex, begin = self._by_part
+        ranges = [(vertex[begin[p] : begin[p + 1]]) for p in range(self.num_parts)]
+        copied = np.flatnonzero(first != np.arange(len(first)))
+        copies = np.concatenate([ranges[p] for p in copied])
+        originals = np.concatenate([ranges[first[p]] for p in copied])
+        fewer = replace(
+            self, faces=self.faces[kept], kept=self.kept[kept], beside=self.beside[kept]
+        )
+        return fewer, copies, originals
+
+    def place(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "X 3"]:
+        """The new vertices' positions."""
+        if self.is_given:
+            return vertices
+        centers = [vertices[loop].mean(axis=0) for loop in self.loops]
+        return np.concatenate([vertices[self.origin], *(c[None] for c in centers)])
+
+    def gather(self, forces: Float[np.ndarray, "X 3"], count: int) -> Float[np.ndarray, "V 3"]:
+        """What forces on the new vertices are on those given, of which there are `count`."""
+        if self.is_given:
+            return forces
+        at, rows = [self.origin], [forces[: len(self.origin)]]
+        for loop, force in zip(self.loops, forces[len(self.origin) :], strict=True):
+            at.append(loop)
+            rows.append(np.repeat(force[None] / len(loop), len(loop), axis=0))
+        return summed(np.concatenate(at), np.concatenate(rows), count)
+
+
+_manifolds: OrderedDict[int, Manifold] = OrderedDict()
+_lock = threading.Lock()
+_next_key = 0
+
+
+def manifold_of(faces: Int[np.ndarray, "F 3"], count: int) -> Manifold:
+    """The faces of `count` vertices rewritten; the last few are kept."""
+    global _next_key
+    with _lock:
+        for key, known in reversed(_manifolds.items()):
+            same = faces is known.given or np.array_equal(known.given, faces)
+            if same and (not known.is_given or len(known.part) == count):
+                _manifolds.move_to_end(key)
+                return known
+    made = _rewritten(faces.astype(np.int64, copy=faces.flags.writeable), count)
+    with _lock:
+        _manifolds[_next_key] = made
+        _next_key += 1
+        while len(_manifolds) > _KEPT:
+            _manifolds.popitem(last=False)
+    return made
+
+
+def matched_half_edges(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, "2 M"], Int[np.ndarray, "U"]]:
+    """Half-edges that run along one edge in opposite senses, two by two, and those left over.
+
+    Half-edge 3 face + k is opposite to corner k. Of an edge with more than two triangles the first
+    in either sense belong together, then the second, and so on.
+    """
+    tail, head = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
+    low, high = np.minimum(tail, head), np.maximum(tail, head)
+    backward = tail > head
+    order = np.lexsort((backward, high, low))
+    new = (np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)
+    edge = np.concatenate([[0], np.cumsum(new)])[: len(order)]
+    sense = 2 * edge + backward[order]
+    place = np.arange(len(order))
+    first = np.concatenate([[True], np.diff(sense) != 0])[: len(order)]
+    rank = place - np.maximum.accumulate(np.where(first, place, 0))
+    forward = np.bincount(edge[~backward[order]], minlength=int(edge.max(initial=-1)) + 1)
+    # The partner of the k-th forward one stands as far behind as there are forward ones.
+    partner = np.where(backward[order], -1, place + forward[edge])
+    there = np.minimum(np.maximum(partner, 0), max(len(order) - 1, 0))
+    found = np.flatnonzero(
+        (partner >= 0)
+        & (partner < len(order))
+        & (sense[there] == sense + 1)
+        & (rank[there] == rank)
+    )
+    pairs = np.stack([order[found], order[partner[found]]])
+    left = np.ones(len(order), bool)
+    left[pairs] = False
+    return pairs, np.flatnonzero(left)
+
+
+def _rewritten(given, count: int) -> Manifold:
+    twice = (given == np.roll(given, 1, axis=1)).any(axis=1)
+    kept = np.flatnonzero(~twice)
+    faces = given[kept]
+    pairs, left = matched_half_edges(faces)
+    loops: list[np.ndarray] = []
+    beside = kept
+    if len(left):
+        loops = _loops(faces, left)
+        at, turn = np.divmod(left, 3)
+        ends = np.stack([faces[at, (turn + 1) % 3], faces[at, (turn + 2) % 3]], axis=1)
+        by_edge = dict(zip(map(tuple, ends.tolist()), kept[at], strict=True))
+        fans = [
+            # A boundary half-edge from a to b wants a triangle that runs from b to a.
+            np.stack([np.roll(loop, -1), loop, np.full(len(loop), count + k)], axis=1)
+            for k, loop in enumerate(loops)
+        ]
+        faces = np.concatenate([faces, *fans])
+        closing = np.concatenate(fans)[:, 1::-1].tolist()
+        beside = np.concatenate([kept, [by_edge[a, b] for a, b in closing]])
+        kept = np.concatenate([kept, np.full(len(faces) - len(kept), -1)])
+        pairs, left = matched_half_edges(faces)
+    total = count + len(loops)
+    vertex, origin = _one_sheet_each(faces, pairs, total)
+    is_given = len(faces) == len(given) and len(origin) == count and not loops
+    part, num_parts = _parts(vertex, len(origin))
+    # Centers of fans come last, and have one sheet each.
+    order = np.argsort(origin >= count, kind="stable")
+    number = np.empty(len(order), np.int64)
+    number[order] = np.arange(len(order))
+    origin = origin[order]
+    return Manifold(
+        given=given,
+        faces=given if is_given else number[vertex],
+        kept=kept,
+        beside=beside,
+        origin=origin[origin < count],
+        loops=tuple(loops[k - count] for k in origin[origin >= count]),
+        part=part[order],
+        num_parts=num_parts,
+        is_given=is_given,
+    )
+
+
+def _loops(faces, left) -> list[np.ndarray]:
+    """The half-edges that have no partner, end to end: each loop's vertices."""
+    face, corner = np.divmod(left, 3)
+    tail, head = faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
+    onward: dict[int, list[int]] = {}
+    for a, b in zip(tail.tolist()[::-1], head.tolist()[::-1], strict=True):
+        onward.setdefault(a, []).append(b)
+    loops = []
+    for start in tail.tolist():
+        while onward.get(start):
+            # As many half-edges lead to a vertex as away from it, so a walk ends where it began.
+            # Where it comes by a vertex again, what lies between is a loop of its own.
+            walk, place = [start], {start: 0}
+            while onward.get(walk[-1]):
+                there = onward[walk[-1]].pop()
+                if there in place:
+                    since = place[there]
+                    loops.append(np.array(walk[since:]))
+                    for vertex in walk[since + 1 :]:
+                        del place[vertex]
+                    walk = walk[: since + 1]
+                else:
+                    place[there] = len(walk)
+                    walk.append(there)
+    return loops
+
+
+def _one_sheet_each(faces, pairs, count: int):
+    """Corners by new vertices, one for each sheet at a vertex, and the old vertex of each."""
+    links = []
+    (a, k), (b, m) = np.divmod(pairs[0], 3), np.divmod(pairs[1], 3)
+    for turn in (1, 2):
+        # The partner runs the other way.
+        links.append(np.stack([3 * a + (k + turn) % 3, 3 * b + (m + 3 - turn) % 3]))
+    first, second = np.concatenate(links, axis=1)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(first), np.int8), (first, second)), shape=(faces.size, faces.size)
+    )
+    sheets, sheet = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    vertex = np.empty(sheets, np.int64)
+    vertex[sheet] = faces.ravel()
+    # The first sheet at a vertex keeps its number; vertices without a triangle keep theirs.
+    order = np.argsort(vertex, kind="stable")
+    fresh = np.concatenate([[True], np.diff(vertex[order]) != 0])[: len(order)]
+    number = np.empty(sheets, np.int64)
+    number[order[fresh]] = vertex[order[fresh]]
+    number[order[~fresh]] = count + np.arange(np.count_nonzero(~fresh))
+    origin = np.concatenate([np.arange(count), vertex[order[~fresh]]])
+    return number[sheet].reshape(faces.shape), origin
+
+
+def _parts(faces, count: int) -> tuple[Int[np.ndarray, "V"], int]:
+    links = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = scipy.sparse.coo_array((np.ones(len(links), np.int8), tuple(links.T)), (count, count))
+    num_parts, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return part, int(num_parts)

@@ -1,0 +1,404 @@
+"""Signs of determinants of vertices, exact, with ties decided by simulation of simplicity.
+
+All that the search for intersections asks of coordinates is on which side of a plane through three
+vertices a fourth one lies, and the same in two dimensions. Where rounding could change the answer
+it is found in whole numbers. Where the answer is exactly zero, the vertices are taken to be moved
+by eps times a push of their own, eps being smaller than any number: the determinant is a polynomial
+in eps, and the first of its coefficients that is not zero has the sign (Edelsbrunner and Muecke
+1990, "Simulation of simplicity", https://doi.org/10.1145/77635.77639; with one eps for all, as in
+Yap 1990). So all answers are those of one surface in general position, whatever touches, coincides
+or lies in one plane: no edge meets another edge, no vertex lies on a triangle.
+
+The push points into the solid, farther for one part than for the next, so that solids that touch
+are moved apart and copies of one solid into each other. That choice only makes contact cheap.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from spt_jax.overlap.vectors import area_normals, summed
+
+# Rounding of a determinant of three differences, against the product of their largest entries: six
+# products of three factors, each factor rounded once, with two roundings a product and at most five
+# in the sums. Twice that, so that nobody has to count again.
+_BOUND = 128 * 2.0**-53
+# The same against the sum of the products' sizes.
+_RELATIVE = 16 * 2.0**-53
+# The same with twice the digits: each operation loses a few units of 2^-106.
+_DOUBLED = 2.0**-97
+# Products below this may have lost bits to underflow.
+_LEAST = 2.0**-900
+
+# Heights of both ends below this many times what rounding may add are worked out exactly.
+_POOR = 2.0**16
+
+# Of the pushes: a step along the normal, and what is added to tell equal ones apart.
+_STEP, _NOISE = 2.0**40, 2.0**28
+
+
+class Predicates:
+    """The signs for one set of vertices.
+
+    Attributes:
+        points: the vertices as (3, V), none of whose coordinates is above one.
+        scale: what they were multiplied by.
+
+    Args:
+        vertices: positions, in any unit.
+        faces: the triangles, whose normals the pushes follow.
+        part: a number for each vertex, the same for those of one connected part.
+    """
+
+    def __init__(
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        faces: Int[np.ndarray, "F 3"],
+        part: Int[np.ndarray, "V"] | None = None,
+    ):
+        # By a power of two, so that nothing is rounded and products of three lengths stay in range.
+        _, exponent = np.frexp(np.abs(vertices).max(initial=0.0))
+        self.scale = float(np.ldexp(1.0, -int(exponent)))
+        self.points = np.ldexp(vertices.T.astype(np.float64, order="C"), -int(exponent))
+        self._faces = faces
+        self._part = part
+
+    @cached_property
+    def push(self) -> Float[np.ndarray, "3 V"]:
+        """How each vertex is moved where a determinant is zero: whole numbers."""
+        count = self.points.shape[1]
+        rows = np.ascontiguousarray(self.points.T)
+        normal = area_normals(rows, self._faces)
+        normal = summed(self._faces.ravel(), np.repeat(normal, 3, axis=0), count)
+        largest = np.abs(normal).max(axis=1, initial=0.0, keepdims=True)
+        normal /= np.where(largest > 0, largest, 1.0)
+        length = np.sqrt((normal * normal).sum(axis=1, keepdims=True))
+        normal /= np.where(length > 0, length, 1.0)
+        depth = np.ones(count)
+        if self._part is not None:
+            depth += self._part / (1.0 + self._part.max(initial=0))
+        return np.rint(-_STEP * (depth[:, None] * normal).T) + np.rint(_NOISE * _noise(count))
+
+    def volume(self, a, b, c, d) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """Signs of the volumes of tetrahedra, positive where d is on the side of abc's normal.
+
+        Args:
+            a, b, c, d: vertices, four different ones in each tetrahedron.
+
+        Returns:
+            The signs, +1 or -1, and six times the volumes: to rounding, and 0.0 where they vanish.
+        """
+        origin = self.points.take(a, axis=1)
+        u, v, w = (self.points.take(x, axis=1) - origin for x in (b, c, d))
+        value = _determinant(u, v, w)
+        bound = _BOUND * (_largest(u) * _largest(v) * _largest(w)) + _LEAST
+        return self._decided(value, bound, (a, b, c, d), (0, 1, 2))
+
+    def area(self, a, b, c, axes: tuple[int, int]) -> Int[np.ndarray, "N"]:
+        """Signs of the areas of triangles seen along an axis: +1 counter-clockwise, -1 clockwise.
+
+        Args:
+            a, b, c: vertices, three different ones in each triangle.
+            axes: the two coordinates that are seen.
+        """
+        points = self.points[list(axes)]
+        origin = points.take(a, axis=1)
+        u, v = (points.take(x, axis=1) - origin for x in (b, c))
+        value = _determinant(u, v)
+        bound = _BOUND * (_largest(u) * _largest(v)) + _LEAST
+        return self._decided(value, bound, (a, b, c), axes)[0]
+
+    def part_before(self, a, b, c, p, q, height) -> Float[np.ndarray, "N"]:
+        """What part of each edge pq lies before its crossing of the triangle abc.
+
+        Args:
+            a, b, c: corners of a triangle that the edge passes through.
+            p, q: the edge's ends.
+            height: (2, N), how far the two are from the plane, times twice the triangle's area.
+        """
+        origin = self.points.take(a, axis=1)
+        largest = [_largest(self.points.take(x, axis=1) - origin) for x in (b, c, p, q)]
+        bound = _BOUND * largest[0] * largest[1] * np.maximum(largest[2], largest[3]) + _LEAST
+        # Both ends almost in the plane: rounding would put the crossing anywhere on the edge.
+        poor = np.flatnonzero(height.sum(axis=0) <= _POOR * bound)
+        if len(poor):
+            corners = [x[poor] for x in (a, b, c)]
+            height = height.copy()
+            for k, end in enumerate((p, q)):
+                rows = [self.points.take(x, axis=1) for x in (*corners, end[poor])]
+                height[k, poor] = np.abs(_whole_determinants(rows)[0])
+        total = height.sum(axis=0)
+        part = height[0] / np.where(total > 0, total, 1.0)
+        flat = np.flatnonzero(total == 0)
+        if len(flat):
+            corners = (self.points.take(x[flat], axis=1) for x in (a, b, c, p, q))
+            part[flat] = _middle_within(*corners)
+        return np.clip(part, 0.0, 1.0)
+
+    def _decided(self, value, bound, corners, axes):
+        open_ = np.flatnonzero(np.abs(value) <= bound)
+        sign = np.where(value < 0, -1, 1)
+        if len(open_):
+            corners = [np.broadcast_to(x, value.shape)[open_] for x in corners]
+            sign[open_], value[open_] = self._exactly(corners, axes)
+        return sign, value
+
+    def _exactly(self, corners, axes):
+        """Signs and values where the plain determinant does not tell."""
+        points = self.points[list(axes)]
+        rows = [points.take(x, axis=1) for x in corners]
+        edges = [x - rows[0] for x in rows[1:]]
+        value, size = _determinant(*edges), _permanent(*edges)
+        known = np.abs(value) > _RELATIVE * size + _LEAST
+        # Products that are all zero sum to zero exactly, and so they do where two corners coincide.
+        small = np.flatnonzero(~known & (size <= _LEAST))
+        zero = small[_vanishes(*(x[:, small] for x in edges))]
+        value[zero], known[zero] = 0.0, True
+        if not known.all():
+            alike = np.zeros(len(value), bool)
+            for i in range(1, len(rows)):
+                for j in range(1, i):
+                    alike |= (rows[i] == rows[j]).all(axis=0)
+            value[alike] = 0.0
+            known |= alike
+        for better in (_doubled_determinants, _whole_determinants):
+            left = np.flatnonzero(~known)
+            if len(left):
+                value[left], known[left] = better([x[:, left] for x in rows])
+        sign = np.sign(value).astype(np.int64)
+        tied = np.flatnonzero(sign == 0)
+        if len(tied):
+            sign[tied] = self._perturbed([x[tied] for x in corners], axes)
+        return sign, value
+
+    def _perturbed(self, corners, axes):
+        """Signs of vanishing determinants once every vertex is moved along its push."""
+        points, push = self.points[list(axes)], self.push[list(axes)]
+        rows = [points.take(x, axis=1) for x in corners]
+        moves = [push.take(x, axis=1) for x in corners]
+        edges, turns = ([x - of[0] for x in of[1:]] for of in (rows, moves))
+        terms = [
+            [turns[k] if moved >> k & 1 else edges[k] for k in range(len(edges))]
+            for moved in range(1, 1 << len(edges))
+        ]
+        sign = np.zeros(rows[0].shape[1], np.int64)
+        for order in range(1, len(edges) + 1):
+            among = [t for m, t in enumerate(terms, 1) if m.bit_count() == order]
+            open_ = np.flatnonzero(sign == 0)
+            if not len(open_):
+                break
+            everything = len(open_) == len(sign)
+            # All terms of one order together, (3, terms, N).
+            factors = [
+                np.stack([x if everything else x[:, open_] for x in column], axis=1)
+                for column in zip(*among, strict=True)
+            ]
+            value = _determinant(*factors).sum(axis=0)
+            size = _permanent(*factors).sum(axis=0)
+            left = np.flatnonzero(np.abs(value) <= 2 * _RELATIVE * size + _LEAST)
+            if len(left):
+                zero = _vanishes(*(x[:, :, left] for x in factors)).all(axis=0)
+                value[left[zero]] = 0.0
+                left = left[~zero]
+            if len(left):
+                at = open_[left]
+                value[left] = _whole_coefficient(
+                    [x[:, at] for x in rows], [x[:, at] for x in moves], order
+                )
+            sign[open_] = np.sign(value)
+        # Pushes that lie in one plane, all of them: one in 1e20.
+        return np.where(sign == 0, 1, sign)
+
+
+def _noise(count: int) -> Float[np.ndarray, "3 V"]:
+    """Numbers from -1 to 1 that follow from their place alone, all different (SplitMix64)."""
+    with np.errstate(over="ignore"):
+        x = np.arange(1, 3 * count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        x ^= x >> np.uint64(31)
+    return (x >> np.uint64(11)).reshape(3, count) * 2.0**-52 - 1.0
+
+
+def _middle_within(a, b, c, p, q):
+    """Of edges that lie in their triangles' planes: the middle of what is within the triangle.
+
+    The edge and the triangle share all of that, and where the one is said to pass through the
+    other changes no volume.
+    """
+    normal = np.abs(np.cross(b - a, c - a, axis=0))
+    # Of triangles without an area, any plane in which they and the edge are seen.
+    slim = np.flatnonzero(normal.max(axis=0, initial=0.0) == 0)
+    longest = np.stack([b - a, c - a, c - b])
+    longest = np.take_along_axis(longest, np.abs(longest).sum(axis=1).argmax(axis=0)[None, None], 0)
+    normal[:, slim] = np.abs(np.cross(longest[0], q - p, axis=0))[:, slim]
+    drop = normal.argmax(axis=0)
+    seen = np.stack([(drop + 1) % 3, (drop + 2) % 3])
+    a, b, c, p, q = (np.take_along_axis(x, seen, 0) for x in (a, b, c, p, q))
+    turn = np.sign(_determinant(b - a, c - a))
+    low, high = np.zeros(p.shape[1]), np.ones(p.shape[1])
+    with np.errstate(all="ignore"):
+        for start, end in ((a, b), (b, c), (c, a)):
+            at_p = turn * _determinant(end - start, p - start)
+            at_q = turn * _determinant(end - start, q - start)
+            crossing = np.clip(at_p / (at_p - at_q), 0.0, 1.0)
+            low = np.where((at_p < 0) & (at_q > 0), np.maximum(low, crossing), low)
+            high = np.where((at_p > 0) & (at_q < 0), np.minimum(high, crossing), high)
+        # A line instead of a triangle: where the edge meets it, or what they share of one line.
+        along = q - p
+        square = (along * along).sum(axis=0)
+        across = [_determinant(along, x - p) for x in (a, b, c)]
+        at = [((x - p) * along).sum(axis=0) / square for x in (a, b, c)]
+        least, most = np.argmin(across, axis=0)[None], np.argmax(across, axis=0)[None]
+        span = np.ptp(across, axis=0)
+        weight = np.take_along_axis(np.stack(across), most, 0)[0] / span
+        meeting = weight * np.take_along_axis(np.stack(at), least, 0)[0]
+        meeting += (1 - weight) * np.take_along_axis(np.stack(at), most, 0)[0]
+        shared = np.clip([np.min(at, axis=0), np.max(at, axis=0)], 0.0, 1.0).mean(axis=0)
+        line = np.where(span > 0, np.clip(meeting, 0.0, 1.0), shared)
+    middle = np.where(turn != 0, (low + high) / 2, line)
+    return np.where(np.isfinite(middle), middle, 0.5)
+
+
+def _largest(x):
+    size = np.abs(x)
+    return np.maximum.reduce(size, axis=0)
+
+
+def _determinant(u, v, w=None):
+    if w is None:
+        return u[0] * v[1] - u[1] * v[0]
+    return (
+        (u[1] * v[2] - u[2] * v[1]) * w[0]
+        + (u[2] * v[0] - u[0] * v[2]) * w[1]
+        + (u[0] * v[1] - u[1] * v[0]) * w[2]
+    )
+
+
+def _permanent(u, v, w=None):
+    u, v = np.abs(u), np.abs(v)
+    if w is None:
+        return u[0] * v[1] + u[1] * v[0]
+    w = np.abs(w)
+    return (
+        (u[1] * v[2] + u[2] * v[1]) * w[0]
+        + (u[2] * v[0] + u[0] * v[2]) * w[1]
+        + (u[0] * v[1] + u[1] * v[0]) * w[2]
+    )
+
+
+def _vanishes(*factors):
+    """Whether each product in the determinants has a factor of zero."""
+    return _permanent(*((x != 0).astype(np.float64) for x in factors)) == 0
+
+
+def _doubled_determinants(rows):
+    """Determinants of the differences to the first row, with twice the digits; where they tell."""
+    edges = [_difference(x, rows[0]) for x in rows[1:]]
+    terms = []
+    if len(edges) == 2:
+        (u, v) = edges
+        terms = [_times(_at(u, 0), _at(v, 1)), _times(_at(u, 1), _minus(_at(v, 0)))]
+    else:
+        u, v, w = edges
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            minor = _plus(_times(_at(u, i), _at(v, j)), _times(_at(u, j), _minus(_at(v, i))))
+            terms.append(_times(minor, _at(w, k)))
+    total = terms[0]
+    for term in terms[1:]:
+        total = _plus(total, term)
+    value = total[0] + total[1]
+    size = _permanent(*(edge[0] for edge in edges))
+    return value, np.abs(value) > _DOUBLED * size + _LEAST
+
+
+def _at(pair, k):
+    return pair[0][k], pair[1][k]
+
+
+def _minus(x):
+    return -x[0], -x[1]
+
+
+def _sum(a, b):
+    """A sum and what rounding took from it (Knuth)."""
+    total = a + b
+    of_b = total - a
+    return total, (a - (total - of_b)) + (b - of_b)
+
+
+def _difference(a, b):
+    return _sum(a, -b)
+
+
+def _product(a, b):
+    """A product and what rounding took from it (Dekker)."""
+    total = a * b
+    (high_a, low_a), (high_b, low_b) = _halves(a), _halves(b)
+    rest = high_a * high_b - total
+    rest += high_a * low_b
+    rest += low_a * high_b
+    rest += low_a * low_b
+    return total, rest
+
+
+def _halves(a):
+    scaled = 134217729.0 * a  # 2^27 + 1
+    high = scaled - (scaled - a)
+    return high, a - high
+
+
+def _plus(x, y):
+    total, rest = _sum(x[0], y[0])
+    return _sum(total, rest + (x[1] + y[1]))
+
+
+def _times(x, y):
+    total, rest = _product(x[0], y[0])
+    return _sum(total, rest + (x[0] * y[1] + x[1] * y[0]))
+
+
+def _whole_determinants(rows):
+    """Determinants of the differences to the first row, exact and then rounded; all are known."""
+    whole, exponent = _whole(rows)
+    found = _determinant(*(x - whole[0] for x in whole[1:]))
+    return _rounded(found, len(rows[1:]) * exponent), True
+
+
+def _whole_coefficient(rows, moves, order):
+    """The coefficient of eps^order of the determinants, exact but for a positive factor."""
+    whole, _ = _whole(rows)
+    push, _ = _whole(moves)
+    edges, turns = ([x - of[0] for x in of[1:]] for of in (whole, push))
+    total: np.ndarray = np.zeros(rows[0].shape[1], object)
+    for moved in range(1, 1 << len(edges)):
+        if moved.bit_count() == order:
+            part = [turns[k] if moved >> k & 1 else edges[k] for k in range(len(edges))]
+            total = total + _determinant(*part)
+    return np.array([(x > 0) - (x < 0) for x in total.tolist()], float)
+
+
+def _whole(rows):
+    """Numbers as Python's whole ones, in units of two to one exponent."""
+    mantissa, exponent = np.frexp(np.stack(rows))
+    mantissa = np.ldexp(mantissa, 53).astype(np.int64)
+    exponent = np.where(mantissa != 0, exponent - 53, np.iinfo(np.int32).max)
+    least = int(exponent.min(initial=0))
+    shift = np.where(mantissa != 0, exponent - least, 0)
+    whole = np.empty(mantissa.shape, object)
+    whole.ravel()[:] = [
+        m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)
+    ]
+    return list(whole), least
+
+
+def _rounded(whole, exponent: int):
+    found = np.empty(len(whole))
+    for k, x in enumerate(whole.tolist()):
+        cut = max(abs(x).bit_length() - 62, 0)
+        found[k] = np.ldexp(float(x >> cut), cut + exponent)
+        if x and not found[k]:
+            found[k] = np.copysign(np.finfo(float).smallest_subnormal, x)
+    return found
