@@ -78,10 +78,10 @@ def classify_vertices(
     V_0, more on V_out, less on V_in, for any depth of overlap, where the counters of the paper's
     Algorithm 1 stop at two.
 
-    The vertex rule finds w_out at the vertex itself, by a ray through it that counts the other
-    triangles in front of it: exact wherever the vertex is not on another sheet. Sheets that
-    touch do not overlap, and of several numbers that are right, at a vertex whose own triangles
-    pass through one another, the nearest to 0 is taken.
+    The vertex rule finds w_out at the vertex itself, exactly, by following it along the surface
+    from one place of each connected part. Sheets that touch do not overlap: on another sheet, but
+    for rounding, a vertex takes the number nearest to 0. At a vertex whose own triangles pass
+    through one another it is the number on most of its edges.
 
     The triangle rule is Algorithm 1's: rays on a lattice give the class of each crossing to the
     three corners of its triangle; where triangles around a vertex disagree, V_out goes before
@@ -94,18 +94,16 @@ def classify_vertices(
         rays: for the triangle rule: "auto", no rays at all, every triangle that lies in an overlap
             anywhere; rays along the longer side of the screen; or (rows, columns). The vertex rule
             does not use it.
-        directions: 1, 3 or the rows of a D x 3 array. By the triangle rule a class seen from any
-            of them counts. By the vertex rule one direction decides; the next ones serve the
-            vertices whose ray goes through a hole of the mesh.
+        directions: 1, 3 or the rows of a D x 3 array: for the triangle rule, by which a class seen
+            from any of them counts.
         rule: "vertex" or "triangle", as above.
         face_groups, ignore_groups, folds: overlaps that do not count, as in
-            `self_intersection_penalty`; their vertices are V_0. Each connected overlap counts
-            whole or not at all.
+            `self_intersection_penalty`; their vertices are V_0. Those of an overlap that counts in
+            part are not.
         backend: as in `self_intersection_penalty`.
 
     Returns:
-        The classes; all V_0 where the penalty is NaN, and V_0 where every ray through the vertex
-        meets a hole.
+        The classes; all V_0 where the penalty is NaN.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`.

@@ -11,6 +11,12 @@ from spt_jax.arguments import as_mesh
 # tip needs 3; the needles beyond would shoot far out of the mesh and into its other parts.
 FARTHEST = 3.0
 
+# How sharply the triangle that a vertex has to move farthest for is told from the others. The
+# largest of several numbers has no derivative where they are equal, as at every vertex of a flat or
+# box-shaped side; the logarithm of a mean of exponentials has. It falls short of the largest by
+# log(1 / share) / 8192 at most: 0.04 % where that triangle has a twentieth of the angle.
+_SHARPNESS = 8192.0
+
 
 def inflate(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
@@ -21,8 +27,10 @@ def inflate(
 
     A vertex moves along its angle-weighted normal n by distance / min(n . n_f) over the triangles
     f around it, at most three distances (a mitre): then every triangle, seen along its own normal,
-    lies at least `distance` farther out than before. Angles, not areas, weigh the normals, so that
-    n does not depend on how a flat side is cut into triangles.
+    lies `distance` farther out than before, or more. The minimum is a smooth one, weighted by
+    angles, so that there is a gradient where triangles lie in one plane too; a triangle with a
+    twentieth of the angle may lie 0.04 % less far out. Angles, not areas, weigh the normals, so
+    that n does not depend on how a flat side is cut into triangles.
 
     Two sheets that do not overlap after both moved by m / 2 are m apart; that is the penalty's
     `margin`. Three things limit it: a tip sharper than 39 degrees moves less than it should, a
@@ -42,8 +50,9 @@ def inflate(
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`, for vertices and faces.
 
-    Differentiation: every mode; finite for every finite mesh. Where several triangles share the
-        least n . n_f, as at a box's corner, each has an equal part of the derivative.
+    Differentiation: every mode; finite for every finite mesh, and right to central differences
+        also where several triangles share the least n . n_f, as on flat sides and at a box's
+        corner.
 
     Example:
         >>> import jax.numpy as jnp, trimesh
@@ -66,8 +75,16 @@ def _inflate(vertices, faces, distance):
     direction, _ = _unit(jnp.zeros_like(finite).at[..., corner, :].add(pull))
     cosine = jnp.sum(direction[..., faces, :] * normal[..., None, :], axis=-1)
     cosine = jnp.where(angle > 0, cosine, 1.0).reshape(*vertices.shape[:-2], -1)
-    steepest = jnp.ones_like(finite[..., 0]).at[..., corner].min(cosine)
-    mitre = 1 / jnp.maximum(steepest, 1 / FARTHEST)
+    needed = 1 / jnp.maximum(cosine, 1 / FARTHEST)
+    nothing = jnp.zeros_like(finite[..., 0])
+    largest = jax.lax.stop_gradient(nothing.at[..., corner].max(needed))
+    weight = angle.reshape(*vertices.shape[:-2], -1)
+    above = jnp.exp(_SHARPNESS * (needed - largest[..., corner])) * weight
+    total = nothing.at[..., corner].add(weight)
+    mean = nothing.at[..., corner].add(above)
+    solid = (mean > 0) & (total > 0)
+    mean = jnp.where(solid, mean, 1.0) / jnp.where(solid, total, 1.0)
+    mitre = jnp.where(solid, largest + jnp.log(mean) / _SHARPNESS, 1.0)
     return vertices + distance * mitre[..., None] * direction
 
 

@@ -43,29 +43,31 @@ def self_intersection_penalty(
 ) -> Float[Array, "*batch"]:
     r"""Volume of a closed mesh's self-intersection, as a loss with its own exact gradient.
 
-    With w the winding number, the volume is the integral of phi(w) over space,
-    phi(w) = max(w - 1, 0) + max(-w, 0): the paper's Eq. 1 for any depth, so a triple overlap
-    counts twice and an inverted region counts too. It is exact, from the triangles alone, or with
+    With w the winding number, the volume is the integral of w (w - 1) / 2 over space: every two
+    solids that overlap in a place count once there. That is the paper's Eq. 1 where two overlap
+    (it stops at two); where three do it is 3, and where the surface is inside out 1. So it is a sum
+    over pairs: that within each of several bodies and that between them add up to the whole. It
+    is exact at any depth, in contact and for parts that coincide, from the triangles alone, or with
     `rays` the paper's sampling (section 3.2): the mean over directions of the overlapped length on
-    the rays times the area of a ray. Without overlap, value and gradient are exactly zero.
+    the rays times the area of a ray. Without overlap, value and gradient are exactly zero; surfaces
+    that only touch, but for rounding, do not overlap.
 
     Args:
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
             must be closed and consistently wound (`check_mesh` tells); it need not be connected.
+            Holes are closed by a fan to the mean of their boundary's vertices.
         value: "volume", in the cube of the unit, or "ratio", the paper's Eq. 11: the part of the
             vertices in self-intersection, piecewise constant and not what the gradient derives.
         gradient: "boundary", the derivative of the volume; "vertex", the paper's Eq. 9, which
             takes each triangle as wholly in or out; "unit", its Eq. 10, of length one at every
             vertex in self-intersection.
         rule: how "ratio", "vertex" and "unit" class the vertices, as in `classify_vertices`.
-        rays: "auto": none. Each connected overlap is measured in closed form, to rounding, so the
-            volume is smooth and its gradient exact. Left to rays is an overlap in which three
-            sheets or more lie over each other, or that has a hole or exact contact, or that counts
-            in part only (`ignore_groups`, `folds`): at most 16,000 rays a direction in the
-            tiles that it touches, or 256 along the longer side where it fills the screen, fixed in
-            the world. Memory grows with the triangles in overlaps and with these rays. Or how many
-            rays along the longer side of the whole screen, or (rows, columns): the paper's way.
+        rays: "auto": none. Everything is measured in closed form, to rounding, so the volume is
+            smooth and its gradient exact, however the mesh is turned. (Should the sums of the
+            closed form not close, which no mesh has been seen to do, 512 rays a side take over;
+            `intersection_report` says so.) Or how many rays along the longer side of the screen, or
+            (rows, columns): the paper's way.
         directions: of the rays, where any are cast: 1 (along -z, the paper's camera), 3 orthogonal
             ones, or the rows of a D x 3 array. With one, "boundary" is the exact derivative of the
             sampled volume; with several, crossings are weighed by how well their direction sees the
@@ -77,17 +79,20 @@ def self_intersection_penalty(
         face_groups: a whole number for each triangle: its body part or person
             (`body.part_groups`, `join_bodies`).
         ignore_groups: pairs of groups whose overlaps do not count, such as ((0, 0), (1, 1)) for
-            "only between the two people". The pair of an overlap is that of the two solids that
-            overlap there. By rays it is told from the sheets in front and behind: between two
-            people and within each add up to the whole within 0.5 %.
-        folds: the surface at rest (`body.rest_surface`). Overlaps of sheets nearer to each other
-            than its `distance` along it are folds, which bending makes at armpits, elbows and
-            groins, and do not count. Which overlaps count is held fixed in the derivative.
+            "only between the two people". Between groups that are closed by themselves that is
+            exact at any depth: what is within and what is between add up to the whole, to
+            rounding. Groups that are parts of one surface are judged as folds are.
+        folds: the surface at rest (`body.rest_surface`). Where triangles intersect that are nearer
+            to each other along it than what lies there may fold (0.3 m on trunk and limbs, 2 to 4
+            cm on fingers), bending made a fold, which does not count. A connected overlap counts
+            with the share of its intersection contour's length that is no fold: whole for two
+            limbs, not at all for the crease of an elbow. The share is a part of the derivative.
+            Parts that lie in each other at rest, as eyeballs in a head, do not count.
         backend: "numpy": on the host; "xla", or `spt_jax.device.settings.Xla` with the sizes of its
-            arrays: in JAX alone, where the vertices are; "auto": "xla" where JAX runs on a GPU or
-            TPU, else "numpy". "xla" measures by rays alone: "auto" means 512, 0.04 % off on bodies
-            in the median and 1.6 % at most. Given rays it agrees with "numpy" to 1e-5, but for
-            folds and groups, told from what the rays meet (`spt_jax.device` has the figures).
+            arrays: in JAX alone, where the vertices are; "auto": "numpy", also where JAX runs on a
+            GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and tells
+            folds and groups by what the rays meet (`spt_jax.device`; `python -m benchmarks.device`
+            prints how far off it is).
 
     Returns:
         One number per mesh, in the vertices' dtype. NaN, with a zero gradient, where there is no

@@ -445,6 +445,26 @@ def test_holes_are_closed_by_fans():
     assert np.sum(pull * motion) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6)
 
 
+def test_solids_that_share_an_edge_by_both_ends():
+    """Merged at an edge of theirs, two sheets cross along it: one counted as four triangles'."""
+    one, other = (
+        box(),
+        moved(box(), trimesh.transformations.rotation_matrix(0.6, (0, 0, 1))[:3, :3]),
+    )
+    other = moved(other, None, one[0][0] - other[0][0])  # turned about the edge of corners 0 and 1
+    vertices, faces = _turned(join(one, other))
+    expected = solved((vertices, faces)).volume
+    assert expected > 0.05
+    merged = np.where(faces == 8, 0, np.where(faces == 9, 1, faces))
+    assert solved((vertices, merged)).volume == pytest.approx(expected, rel=1e-12)
+    # Hanging together elsewhere too, they have one sheet at both of its ends.
+    row = np.arange(len(merged))
+    for seed in range(5):
+        order = np.random.default_rng(seed).permutation(row)
+        found = solved((vertices, merged[order]))
+        assert found.volume == pytest.approx(expected, rel=1e-12)
+
+
 def test_sums_that_do_not_close_are_noticed():
     """If a crossing went missing the sums of constants would not vanish, and rays be cast."""
     found = solved(_turned(PAIR))

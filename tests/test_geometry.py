@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from helpers import bent_tube, body_faces, box, inverted, moved, posed_bodies, random_rotation
 from helpers import sphere as solid_sphere
 
@@ -28,9 +29,14 @@ def slow_displacement(vertices, faces):
             p, q = (vertices[faces[f][(k + i) % 3]] - vertices[v] for i in (1, 2))
             cosine = p @ q / np.linalg.norm(p) / np.linalg.norm(q)
             total += np.arccos(np.clip(cosine, -1, 1)) * normal[f]
-            around.append(normal[f])
+            around.append((np.arccos(np.clip(cosine, -1, 1)), normal[f]))
         direction = total / np.linalg.norm(total)
-        out[v] = direction / max(1 / FARTHEST, min(n @ direction for n in around))
+        angles, cosines = np.array([(angle, n @ direction) for angle, n in around]).T
+        needed = 1 / np.maximum(cosines, 1 / FARTHEST)
+        # A smooth largest one: the logarithm of a mean of exponentials.
+        mitre = scipy.special.logsumexp(8192 * needed, b=angles / angles.sum()) / 8192
+        assert 0.999 * needed.max() <= mitre <= needed.max() * (1 + 1e-12)
+        out[v] = mitre * direction
     return out
 
 
@@ -57,7 +63,8 @@ def test_every_triangle_of_a_posed_body_moves_at_least_the_distance(x64):
     length = np.linalg.norm(shift, axis=1)
     whole = (length < 0.999 * FARTHEST)[faces]  # neither cut short by the farthest move
     assert whole.mean() > 0.99
-    assert outwards[whole].min() > 1 - 1e-9
+    assert outwards[whole].min() > 1 - 1e-3  # of small angles among large ones
+    assert np.median(outwards[whole]) > 1 - 1e-9
     assert length.max() <= FARTHEST + 1e-9
     assert np.median(length) < 1.05
 

@@ -350,3 +350,12 @@ def test_memory_of_meshes_is_bounded(rng):
         edge_crossings(rng.normal(size=(k, 3)), np.array([[0, 1, 2], [1, 2, 3]]))
     assert len(pair_layout._meshes) <= 4
     assert all(a is not b for a, b in combinations(pair_layout._meshes.values(), 2))
+
+
+def test_a_triangle_as_large_as_the_mesh_meets_no_empty_slot():
+    """It spans the box around everything along all axes; each crossing is listed once."""
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 3, 2], [1, 3, 0], [1, 2, 3]])
+    mesh = join((corner, faces), box((0.2, 0.3, 0.4), (0.3, 0.35, 0.3)))
+    found = edge_crossings(*mesh)
+    assert len(found.face) == len(found_in(mesh)) > 0

@@ -184,7 +184,7 @@ class ExactSurface:
         """
         proper = self.proper[layer.segments]
         # A sheet is closed by fans that lie in its own plane.
-        flat = len(self.manifold.loops) > 0
+        flat = self.manifold.num_fans > 0
         if proper.all() and not flat:
             return layer
         region, count = regions_of(self, layer)

@@ -3,7 +3,9 @@
 Winding numbers depend on where the triangles are and not on how their corners are named. So any
 list of triangles is rewritten, without moving one: edges of more than two triangles are shared by
 two at a time, vertices at which several sheets meet become one vertex each, and what is missing
-along boundary loops is filled by fans. Triangles that list a vertex twice have no area and go.
+along boundary loops is filled by fans. Two sheets that still have both ends of an edge in common
+might pass through each other along it, where no crossing shows: each is given a middle of its own
+there. Triangles that list a vertex twice have no area and go.
 """
 
 import threading
@@ -29,8 +31,10 @@ class Manifold:
         faces: of the new vertices; first those that were given, in their order, then the fans.
         kept: for each of these the number of the face given; -1 in fans.
         beside: the same, but for a fan's triangle the face at the edge that it closes.
-        origin: the given vertex at which each new one is; those after `count` are fans' centers.
-        loops: of each boundary loop, the given vertices along it.
+        origin: the given vertex at which each new one is; after those come centers.
+        loops: of each center the given vertices of which it is the mean: those along a boundary
+            loop, which a fan closes, or the two ends of an edge.
+        num_fans: how many boundary loops were closed.
         part: the number of each new vertex's connected part.
         num_parts: how many parts there are.
         is_given: whether nothing had to be rewritten.
@@ -42,14 +46,10 @@ class Manifold:
     beside: Int[np.ndarray, "G"]
     origin: Int[np.ndarray, "W"]
     loops: tuple[Int[np.ndarray, "_"], ...]
+    num_fans: int
     part: Int[np.ndarray, "X"]
     num_parts: int
     is_given: bool
-
-    @property
-    def num_fan_faces(self) -> int:
-        """Triangles that fill boundary loops."""
-        return int(np.count_nonzero(self.kept < 0))
 
     @cached_property
     def _by_part(self) -> tuple[Int[np.ndarray, "X"], Int[np.ndarray, "P1"]]:
@@ -204,10 +204,17 @@ def _rewritten(given, count: int) -> Manifold:
         kept = np.concatenate([kept, np.full(len(faces) - len(kept), -1)])
         pairs, left = matched_half_edges(faces)
     total = count + len(loops)
+    num_fans = len(loops)
     vertex, origin = _one_sheet_each(faces, pairs, total)
-    is_given = len(faces) == len(given) and len(origin) == count and not loops
+    while True:
+        split = _with_middles(vertex, origin, loops, count)
+        if split is None:
+            break
+        vertex, origin, source = split
+        kept, beside = kept[source], beside[source]
+    is_given = len(vertex) == len(given) and len(origin) == count and not loops
     part, num_parts = _parts(vertex, len(origin))
-    # Centers of fans come last, and have one sheet each.
+    # Centers come last, and have one sheet each.
     order = np.argsort(origin >= count, kind="stable")
     number = np.empty(len(order), np.int64)
     number[order] = np.arange(len(order))
@@ -219,10 +226,42 @@ def _rewritten(given, count: int) -> Manifold:
         beside=beside,
         origin=origin[origin < count],
         loops=tuple(loops[k - count] for k in origin[origin >= count]),
+        num_fans=num_fans,
         part=part[order],
         num_parts=num_parts,
         is_given=is_given,
     )
+
+
+def _with_middles(vertex, origin, loops: list[np.ndarray], count: int):
+    """The faces with one triangle each cut at an edge that several sheets share by both ends.
+
+    Returns:
+        None where there is no such edge; else the faces, the origin of all vertices and which of
+        the last faces each was a part of. The edge's ends are added to `loops`.
+    """
+    pairs, _ = matched_half_edges(vertex)
+    face, turn = np.divmod(pairs, 3)
+    ends = np.sort(np.stack([vertex[face[0], (turn[0] + k) % 3] for k in (1, 2)], axis=1), axis=1)
+    _, at, often = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    shared = np.flatnonzero(often[at.ravel()] > 1)
+    if not len(shared):
+        return None
+    faces, source = vertex.tolist(), list(range(len(vertex)))
+    origin, cut = origin.tolist(), set()
+    for row in shared.tolist():
+        if not cut.isdisjoint(face[:, row].tolist()):
+            continue
+        cut.update(face[:, row].tolist())
+        middle = len(origin)
+        origin.append(count + len(loops))
+        loops.append(np.array([origin[end] for end in ends[row].tolist()]))
+        for f, k in zip(face[:, row].tolist(), turn[:, row].tolist(), strict=True):
+            corner = vertex[f].tolist()
+            faces[f] = [corner[k], corner[(k + 1) % 3], middle]
+            faces.append([corner[k], middle, corner[(k + 2) % 3]])
+            source.append(f)
+    return np.array(faces), np.array(origin), np.array(source)
 
 
 def _loops(faces, left) -> list[np.ndarray]:

@@ -18,7 +18,7 @@ _CHUNK = 1 << 17
 # A coordinate of a box takes 20 bits and a guard bit, three to a word: two subtractions of words
 # do the six comparisons of two boxes, and a pair gathers four numbers instead of twelve.
 _FIELD = 21
-_STEPS = (1 << (_FIELD - 1)) - 2
+_STEPS = (1 << (_FIELD - 1)) - 3  # one more for what is rounded up, and one for empty slots
 _GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
 _BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
 _Pairs = list[tuple[np.ndarray, np.ndarray]]
@@ -69,7 +69,7 @@ def _shape(points, layout: Layout) -> Shape:
     # step, and so do boxes that are apart by rounding.
     low = ((low - base) * scale).astype(np.int64)
     high = ((high - base) * scale).astype(np.int64) + 1
-    low[:, layout.empty] = _STEPS + 1
+    low[:, layout.empty] = _STEPS + 2  # above every other, also one that spans the mesh
     high[:, layout.empty] = 0
     length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     words = _word(low), _word(high) | _GUARDS

@@ -23,13 +23,35 @@ def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
         near = reach * shape.length.take(y)
         np.maximum(margin, near, out=margin)
         kept = np.flatnonzero((height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin))
-        height, near = height.take(kept, axis=1), near.take(kept)
+        height, margin, near = height.take(kept, axis=1), margin.take(kept), near.take(kept)
+        flat = np.flatnonzero(np.abs(height).max(axis=0) <= margin)
+        if len(flat):
+            # In one plane; nearly all of a flat side's are apart in it.
+            apart = flat[_apart_in_plane(layout, shape, x[kept[flat]], y[kept[flat]], reach)]
+            kept, height, near = (np.delete(of, apart, axis=-1) for of in (kept, height, near))
         on = np.flatnonzero(np.abs(height).min(axis=0) <= near)
         if len(on):
             contacts.append(_contacts(layout, shape, x[kept[on]], y[kept[on]], reach))
         t, u = t[kept], u[kept]
     vertex, face = (np.concatenate(x) for x in zip(_NO_CONTACT, *contacts, strict=True))
     return t, u, vertex, face
+
+
+def _apart_in_plane(layout: Layout, shape: Shape, x, y, reach: float):
+    """Which pairs of triangles in one plane are parted by the line of a side of either."""
+    apart = np.zeros(len(x), bool)
+    for own, other in ((x, y), (y, x)):
+        normal, length = shape.normal.take(own, axis=1), shape.length.take(own)
+        sense, points = layout.sense.take(own), shape.corner.take(other, axis=2)
+        corner = shape.corner.take(own, axis=2)
+        extent = shape.extent.take(own) + shape.extent.take(other)
+        for k in range(3):
+            start = corner[:, k]
+            side = corner[:, (k + 1) % 3] - start
+            inward = _dot(cross(normal, side)[:, None] * sense, points - start[:, None])
+            size = np.sqrt(_dot(side, side)) * length
+            apart |= inward.max(axis=0) < -np.maximum(reach, ROUNDING * extent) * size
+    return apart
 
 
 def _contacts(layout: Layout, shape: Shape, x, y, reach: float):
