@@ -22,9 +22,9 @@ from helpers import (
 )
 from helpers_exact import exact_overlap
 
-from spt_jax.overlap.exact import regions_of
 from spt_jax.overlap.exclusions import NOTHING
 from spt_jax.overlap.measure import measure
+from spt_jax.overlap.surface import regions_of
 from spt_jax.overlap.triangles.closed_form import shares_of
 
 

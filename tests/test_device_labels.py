@@ -7,7 +7,7 @@ from helpers import body_faces, posed_bodies
 from helpers_device import SOLIDS, padded
 
 from spt_jax import classify_vertices
-from spt_jax.overlap.exact import ExactSurface
+from spt_jax.overlap.surface import ExactSurface
 
 FRAMES = ["crawl/0092", "roll/0056", "run/0010"]
 

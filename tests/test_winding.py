@@ -20,8 +20,9 @@ from helpers import (
 )
 from scipy.spatial import ConvexHull
 
-from spt_jax.overlap.exact import ExactOverlap, ExactSurface
+from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.measure import Unmeasurable, measure
+from spt_jax.overlap.surface import ExactSurface
 
 FRAMES = ["roll/0053", "crawl/0092", "dance_a/0068"]
 

@@ -1,236 +1,36 @@
-"""One surface measured exactly: what intersects, what overlaps, and how much of it counts.
+"""How much of a surface's overlap counts: volume, gradient and labels, exactly."""
 
-From the vertices to the result: the surface is closed and cut into sheets (`manifold.py`), edges
-that pass through triangles are found (`pairs.py`), with exact signs (`predicates.py`), joined to
-contours (`contours.py`), the winding number is followed along the surface (`winding.py`), and sums
-over triangles give volume and gradient (`closed_form.py`). What does not count is left out by parts
-or weighted by regions (`exclusions.py`).
-"""
-
-from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int
 
-from spt_jax.overlap.exclusions import NOTHING, Exclusions, pair_weights, part_rules
-from spt_jax.overlap.triangles.closed_form import Shares, gradient_of, shares_of, volumes_of
-from spt_jax.overlap.triangles.contours import Contours, find_contours, length_gradient
-from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
-from spt_jax.overlap.triangles.pair_layout import Topology, prepared
-from spt_jax.overlap.triangles.pairs import Contacts, EdgeCrossings, find_intersections
-from spt_jax.overlap.triangles.predicates import Predicates
-from spt_jax.overlap.triangles.regions import connected_regions
-from spt_jax.overlap.triangles.winding import Ends, enclosing_parts, labels_of, winding_numbers
-from spt_jax.overlap.vectors import dot, summed
-
-# Vertices that are moved by this many units in the last place of the largest coordinate, as turning
-# a mesh moves them, neither enter a triangle that they touch nor leave it.
-_CONTACT = 8.0
+from spt_jax.overlap.exclusions import NOTHING, Exclusions, pair_weights
+from spt_jax.overlap.surface import ExactSurface, Layer, regions_of
+from spt_jax.overlap.triangles.closed_form import gradient_of, volumes_of
+from spt_jax.overlap.triangles.contours import length_gradient
+from spt_jax.overlap.vectors import summed
 
 
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """The overlaps between the parts that one choice of pairs names.
+class Judged(NamedTuple):
+    """Overlaps that count with a share of their contour.
 
     Attributes:
-        ends: the winding numbers, of which this layer has the column `column`.
-        column: of the layer.
-        counts: which crossings belong to it.
-        contours: the segments that do.
-        crossings: as in the surface, of which the contours' ends are rows.
-        shares: the triangles' contributions.
-        dropped: triangles of overlaps that are there by rounding alone.
+        layer: these overlaps.
+        region: of each of the layer's triangles.
+        at: the region of each of its segments.
+        volume: of each region.
+        length: of each region's contour.
+        share: what part of that length counts; 1 of a region without a contour.
     """
 
-    ends: Ends
-    column: int
-    counts: Bool[np.ndarray, "K"]
-    contours: Contours
-    segments: Bool[np.ndarray, "P"]
-    shares: Shares
-    dropped: Int[np.ndarray, "D"] = field(default_factory=lambda: np.zeros(0, np.int64))
-
-
-class ExactSurface:
-    """A surface, and all that its triangles tell by themselves.
-
-    Attributes:
-        count: how many vertices were given.
-        times: how often each triangle is there where copies are measured once; None: each once.
-        manifold: the surface closed and cut into sheets.
-        scale: coordinates are multiplied by this, a power of two.
-        points: the new vertices' scaled positions.
-        crossings, contacts, contours: where the surface meets itself.
-        proper: which of the contours' pairs intersect, and do not only touch.
-
-    Raises:
-        Entangled: the triangles are too many to a place to be listed.
-    """
-
-    def __init__(
-        self,
-        vertices: Float[np.ndarray, "V 3"],
-        faces: Int[np.ndarray, "F 3"],
-        rounding: float,
-        merged: bool = False,
-    ):
-        self.count = len(vertices)
-        self.manifold: Manifold = manifold_of(faces, len(vertices))
-        placed = self.manifold.place(vertices)
-        # Of parts that lie on each other, vertex on vertex, one is measured for all.
-        self.parts_times = self.times = None
-        if merged and self.manifold.num_parts > 1:
-            first = self.manifold.copies(placed)
-            if (first != np.arange(len(first))).any():
-                self.manifold, self._copies, self._originals = self.manifold.without(first)
-                self.parts_times = np.bincount(first, minlength=len(first))
-                self.times = self.parts_times[self.manifold.part[self.manifold.faces[:, 0]]]
-        self._faces = self.manifold.faces
-        self.predicates = Predicates(placed, self._faces, self.manifold.part)
-        self.scale = self.predicates.scale
-        self.points = np.ascontiguousarray(self.predicates.points.T)
-        self.topology: Topology = prepared(self._faces, len(placed)).topology
-        self._reach = _CONTACT * rounding
-        self.crossings: EdgeCrossings
-        self.contacts: Contacts
-        self.crossings, self.contacts = find_intersections(
-            self.points, self._faces, predicates=self.predicates, reach=self._reach
-        )
-        self.contours = find_contours(self.points, self.topology, self.crossings)
-
-    @cached_property
-    def proper(self) -> Bool[np.ndarray, "P"]:
-        """Pairs of triangles that intersect, and do not only touch."""
-        return self.contours.proper(self.points, self._faces, self._reach)
-
-    @cached_property
-    def pairs(self) -> Int[np.ndarray, "P 2"]:
-        """Of all contours, the faces given: where a fan is one of them, the face beside it."""
-        return self.manifold.beside[self.contours.pair]
-
-    @cached_property
-    def listed(self) -> Bool[np.ndarray, "P"]:
-        """Pairs of triangles that were given, not fans, and intersect properly."""
-        return self.proper & (self.manifold.kept[self.contours.pair] >= 0).all(axis=1)
-
-    def with_copies(self, values: Shaped[np.ndarray, "X ..."]) -> Shaped[np.ndarray, "X ..."]:
-        """What is known at the new vertices, copied to the parts that were left out."""
-        if self.times is not None:
-            values[self._copies] = values[self._originals]
-        return values
-
-    def of_given(self, values: Shaped[np.ndarray, "V"]) -> Shaped[np.ndarray, "V"]:
-        """The same for values at the vertices given."""
-        if self.times is not None:
-            origin = np.append(self.manifold.origin, np.full(len(self.manifold.loops), -1))
-            copies, originals = origin[self._copies], origin[self._originals]
-            kept = (copies >= 0) & (originals >= 0)
-            values[copies[kept]] = values[originals[kept]]
-        return values
-
-    def count_pairs(self, on: Bool[np.ndarray, "P"]) -> int:
-        """How many pairs of the triangles given some contours stand for."""
-        if self.times is None:
-            return int(np.count_nonzero(on))
-        return int(self.times[self.contours.pair[on]].prod(axis=1).sum())
-
-    def layers(self, exclusions: Exclusions) -> list[Layer]:
-        """The overlaps that count whole, and those that are judged by their contours."""
-        faces, part = self._faces, self.manifold.part
-        rules = None if not exclusions.any else part_rules(exclusions, self.manifold)
-
-        def counted(first, second):
-            if rules is None:
-                return np.ones((len(first), 1), bool)
-            return rules(first, second)
-
-        first, second = part[self.crossings.edge[:, 0]], part[faces[self.crossings.face, 0]]
-        counts = counted(first, second)
-        of_pairs = counted(*part[faces[self.contours.pair, 0]].T)
-        ends = winding_numbers(
-            self.topology,
-            self.manifold,
-            self.predicates,
-            self.crossings,
-            self.contours,
-            counts,
-            counted,
-            self.parts_times,
-        )
-        found = []
-        for column in range(counts.shape[1]):
-            on, segments = counts[:, column], of_pairs[:, column]
-            every = bool(on.all())
-            crossings = self.crossings if every else self.crossings.only(on)
-            contours = self.contours
-            if not every:
-                number = np.cumsum(on) - 1
-                contours = contours.only(segments)
-                end = np.where(contours.end >= 0, number[contours.end], -1)
-                contours = _with_ends(contours, end)
-            shares = shares_of(
-                self.points, self.topology, crossings, contours, ends, column, self.times
-            )
-            layer = Layer(ends, column, on, contours, segments, shares)
-            found.append(self._without_contact(layer))
-        return found
-
-    def _without_contact(self, layer: Layer) -> Layer:
-        """The layer without overlaps that are only there by rounding.
-
-        Where solids touch and the mesh was turned, one may be in the other by a unit in the last
-        place, all along a face: the volume is as good as nothing, its gradient is not.
-        """
-        proper = self.proper[layer.segments]
-        # A sheet is closed by fans that lie in its own plane.
-        flat = self.manifold.num_fans > 0
-        if proper.all() and not flat:
-            return layer
-        region, count = regions_of(self, layer)
-        of_face = np.full(len(self._faces), -1)
-        of_face[layer.shares.faces] = region
-        at = of_face[layer.contours.pair[:, 0]]
-        touching = (np.bincount(at, minlength=count) > 0) | flat
-        touching[at[proper]] = False
-        if not touching.any():
-            return layer
-        shares = layer.shares
-        volume = volumes_of(self.points, self._faces, shares, region, count, self.times)
-        area = np.bincount(region, np.sqrt(dot(shares.normals, shares.normals)), count)
-        kept = ~(touching & (np.abs(volume) <= 2 * self._reach * area))
-        segments = layer.segments.copy()
-        segments[segments] = kept[at]
-        return replace(
-            layer,
-            segments=segments,
-            contours=layer.contours.only(kept[at]),
-            shares=shares.only(kept[region]),
-            dropped=shares.faces[~kept[region]],
-        )
-
-    def labels(self, layer: Layer, exclusions: Exclusions) -> Int[np.ndarray, "W"]:
-        """w_out around each new vertex on one layer, where contact is no overlap."""
-        part = self.manifold.part
-        counts = np.ones(len(self.contacts.vertex), bool)
-        if exclusions.any and len(counts):
-            first = part[self.contacts.vertex]
-            second = part[self._faces[self.contacts.face, 0]]
-            counts = part_rules(exclusions, self.manifold)(first, second)[:, layer.column]
-        side, _ = self.predicates.volume(*self._faces[self.contacts.face].T, self.contacts.vertex)
-        found = labels_of(
-            self.topology, layer.ends, layer.column, self.contacts, side, counts, part
-        )
-        if len(layer.dropped):
-            nothing = np.zeros(len(found), bool)
-            nothing[self._faces[layer.dropped]] = True
-            nothing[self._faces[layer.shares.faces]] = False
-            found[nothing] = 0
-        return found
-
-
-def _with_ends(contours: Contours, end) -> Contours:
-    return Contours(**{**vars(contours), "end": end})
+    layer: Layer
+    region: Int[np.ndarray, "H"]
+    at: Int[np.ndarray, "S"]
+    volume: Float[np.ndarray, "R"]
+    length: Float[np.ndarray, "R"]
+    share: Float[np.ndarray, "R"]
 
 
 class ExactOverlap:
@@ -244,97 +44,84 @@ class ExactOverlap:
     def __init__(self, surface: ExactSurface, exclusions: Exclusions = NOTHING):
         self.surface = surface
         self._exclusions = exclusions
-        whole, *judged = surface.layers(exclusions)
-        self._whole: Layer = whole
-        self._judged: Layer | None = judged[0] if judged else None
+        self._layers = surface.layers(exclusions)
 
     @property
     def sound(self) -> bool:
         """Whether all sums close and all winding numbers fit together."""
-        layers = [layer for layer in (self._whole, self._judged) if layer is not None]
-        return all(layer.ends.fits and bool(layer.shares.sound.all()) for layer in layers)
+        return all(layer.ends.fits and bool(layer.shares.sound.all()) for layer in self._layers)
 
-    @cached_property
-    def _regions(self) -> tuple[Int[np.ndarray, "H"], int]:
-        """Of the judged layer's triangles: the region, and how many there are."""
-        if self._judged is None:
-            return np.zeros(0, np.int64), 0
-        return regions_of(self.surface, self._judged)
+    @property
+    def _whole(self) -> Layer:
+        return self._layers[0]
 
     @cached_property
     def pair_weights(self) -> Float[np.ndarray, "P"]:
         """How much each of the surface's contours counts as a collision."""
         weight = np.zeros(len(self.surface.pairs))
         weight[self._whole.segments] = 1.0
-        if self._judged is not None:
-            on = np.flatnonzero(self._judged.segments)
+        for layer in self._layers[1:]:
+            on = np.flatnonzero(layer.segments)
             weight[on] = pair_weights(self._exclusions, *self.surface.pairs[on].T)
         return weight * self.surface.proper
 
     @cached_property
-    def _contour_shares(self):
-        """Of each judged region: its volume, the contour's length, and what share of it counts."""
-        layer, (region, count) = self._judged, self._regions
-        if layer is None:
-            return np.zeros((3, 0))
-        surface = self.surface
-        volume = volumes_of(surface.points, surface.manifold.faces, layer.shares, region, count)
-        at = self._region_of_segments
-        length = layer.contours.length
-        weight = self.pair_weights[layer.segments]
-        total = np.bincount(at, length, count)
-        far = np.bincount(at, weight * length, count)
-        none = np.bincount(at, minlength=count) == 0
-        share = np.where(total > 0, far / np.where(total > 0, total, 1.0), 0.0)
-        return np.stack([volume, total, np.where(none, 1.0, share)])
-
-    @cached_property
-    def _region_of_segments(self) -> Int[np.ndarray, "S"]:
-        layer, (region, _) = self._judged, self._regions
-        of_face = np.full(len(self.surface.manifold.faces), -1)
+    def judged(self) -> Judged | None:
+        if len(self._layers) < 2:
+            return None
+        layer, surface = self._layers[1], self.surface
+        region, count = regions_of(surface, layer)
+        of_face = np.full(len(surface.manifold.faces), -1)
         of_face[layer.shares.faces] = region
-        return of_face[layer.contours.pair[:, 0]]
+        at = of_face[layer.contours.pair[:, 0]]
+        volume = volumes_of(surface.points, surface.manifold.faces, layer.shares, region, count)
+        length = layer.contours.length
+        total = np.bincount(at, length, count)
+        far = np.bincount(at, self.pair_weights[layer.segments] * length, count)
+        share = np.where(total > 0, far / np.where(total > 0, total, 1.0), 0.0)
+        share[np.bincount(at, minlength=count) == 0] = 1.0
+        return Judged(layer, region, at, volume, total, share)
 
     @cached_property
     def volume(self) -> float:
         """The overlap volume that counts."""
-        shares, total = self._whole.shares, 0.0
-        surface = self.surface
+        surface, shares, total = self.surface, self._whole.shares, 0.0
         if len(shares.faces):
             together = np.zeros(len(shares.faces), np.int64)
             faces, times = surface.manifold.faces, surface.times
-            total = volumes_of(surface.points, faces, shares, together, 1, times)[0]
-        volume, _, share = self._contour_shares
-        total += float(volume @ share)
-        return max(float(total), 0.0) / surface.scale**3
+            total = float(volumes_of(surface.points, faces, shares, together, 1, times)[0])
+        if self.judged is not None:
+            total += float(self.judged.volume @ self.judged.share)
+        return max(total, 0.0) / surface.scale**3
 
     def gradient(self) -> Float[np.ndarray, "V 3"]:
         """The derivative of the volume, at the vertices given."""
         surface = self.surface
         faces, count = surface.manifold.faces, len(surface.points)
         total = gradient_of(faces, self._whole.shares, None, count)
-        layer, (region, _) = self._judged, self._regions
-        if layer is not None and len(region):
-            volume, length, share = self._contour_shares
-            total += gradient_of(faces, layer.shares, share[region], count)
-            mixed = np.flatnonzero((share > 0) & (share < 1))
-            at = self._region_of_segments
-            some = np.isin(at, mixed)
-            if some.any():
-                # Where a part of the contour counts, the share changes with the lengths.
-                weight = self.pair_weights[layer.segments][some]
-                at = at[some]
-                rate = volume[at] * (weight - share[at]) / length[at]
-                vertex, force = length_gradient(
-                    surface.points,
-                    faces,
-                    surface.crossings.only(layer.counts),
-                    layer.contours.only(some),
-                    rate,
-                )
-                total += summed(vertex, force, count)
+        if self.judged is not None:
+            total += self._judged_gradient(self.judged)
         total = surface.with_copies(total / surface.scale**2)
         return surface.manifold.gather(total, surface.count)
+
+    def _judged_gradient(self, judged: Judged) -> Float[np.ndarray, "X 3"]:
+        """Of sum of s V over the regions: s dV, and V ds where a part of the contour counts.
+
+        With L the segments' lengths, 1 or 0 the weights k of those that count, and T the sum of L,
+        s is the sum of k L over T, and ds the sum of (k - s) / T dL.
+        """
+        surface, layer, share = self.surface, judged.layer, judged.share
+        faces, count = surface.manifold.faces, len(surface.points)
+        total = gradient_of(faces, layer.shares, share[judged.region], count)
+        mixed = ((share > 0) & (share < 1))[judged.at]
+        if mixed.any():
+            at, weight = judged.at[mixed], self.pair_weights[layer.segments][mixed]
+            rate = judged.volume[at] * (weight - share[at]) / judged.length[at]
+            crossings = surface.crossings.only(layer.counts)
+            contours = layer.contours.only(mixed)
+            vertex, force = length_gradient(surface.points, faces, crossings, contours, rate)
+            total += summed(vertex, force, count)
+        return total
 
     @cached_property
     def winding(self) -> Int[np.ndarray, "V"]:
@@ -342,15 +129,14 @@ class ExactOverlap:
 
         A vertex at which several sheets meet takes the number nearest to zero of them all.
         """
-        surface = self.surface
+        surface, judged = self.surface, self.judged
         found = surface.labels(self._whole, self._exclusions)
-        layer, (region, _) = self._judged, self._regions
-        if layer is not None:
-            counted = self._contour_shares[2] > 0
-            judged = surface.labels(layer, self._exclusions)
-            kept = np.zeros(len(judged), bool)
-            kept[surface.manifold.faces[layer.shares.faces[counted[region]]]] = True
-            found = np.where(found != 0, found, np.where(kept, judged, 0))
+        if judged is not None:
+            counting = judged.layer.shares.faces[(judged.share > 0)[judged.region]]
+            kept = np.zeros(len(found), bool)
+            kept[surface.manifold.faces[counting]] = True
+            own = surface.labels(judged.layer, self._exclusions)
+            found = np.where(found != 0, found, np.where(kept, own, 0))
         found = surface.with_copies(found)
         if surface.manifold.is_given:
             return found
@@ -364,52 +150,19 @@ class ExactOverlap:
         """Pairs of the triangles given that intersect and count."""
         return self.surface.count_pairs((self.pair_weights > 0) & self.surface.listed)
 
-    def areas(self) -> tuple[Int[np.ndarray, "H"], Int[np.ndarray, "H 3"], Float[np.ndarray, "H"]]:
-        """Faces given that bound overlaps which count, w_out at their corners, and the integral of
-        w_out over each as a part of its area."""
-        parts = []
-        for layer in (self._whole, self._judged):
-            if layer is None:
-                continue
+    def areas(
+        self,
+    ) -> tuple[Int[np.ndarray, "H"], Int[np.ndarray, "H 3"], Float[np.ndarray, "H"]]:
+        """Faces given that bound overlaps which count, w_out at their corners, and its mean."""
+        manifold, parts = self.surface.manifold, []
+        for layer in self._layers:
             faces = layer.shares.faces
-            kept = self.surface.manifold.kept[faces] >= 0
-            if layer is self._judged:
-                region, _ = self._regions
-                kept &= (self._contour_shares[2] > 0)[region]
+            kept = manifold.kept[faces] >= 0
+            if self.judged is not None and layer is self.judged.layer:
+                kept &= (self.judged.share > 0)[self.judged.region]
             faces = faces[kept]
-            corners = layer.ends.of_vertices()[:, layer.column][self.surface.manifold.faces[faces]]
+            corners = layer.ends.of_vertices()[:, layer.column][manifold.faces[faces]]
             share = 2 * layer.shares.share[kept].sum(axis=1)
-            parts.append((self.surface.manifold.kept[faces], corners, share))
-        return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
-
-
-def regions_of(surface: ExactSurface, layer: Layer) -> tuple[Int[np.ndarray, "H"], int]:
-    """Of the triangles of a layer the region, and how many regions there are."""
-    within = layer.ends.of_vertices()[:, layer.column] != 0
-    within[layer.contours.cusp[layer.contours.cusp >= 0]] = True
-    return connected_regions(
-        surface.manifold.faces, layer.shares.faces, within, layer.contours.pair
-    )
-
-
-def parts_in_each_other(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Int[np.ndarray, "N 2"]:
-    """Pairs of connected parts (`Manifold.part`) that intersect, or of which one encloses another.
-
-    Args:
-        vertices: positions.
-        faces: indices of each triangle's corners.
-
-    Returns:
-        Numbers of parts, the lower first.
-    """
-    manifold = manifold_of(faces, len(vertices))
-    named = np.unique(manifold.part[manifold.faces])
-    if len(named) < 2:
-        return np.zeros((0, 2), np.int64)
-    surface = ExactSurface(vertices, faces, float(np.finfo(np.float64).eps))
-    pairs = manifold.part[manifold.faces[surface.contours.pair[surface.proper], 0]]
-    inner, outer = enclosing_parts(surface.topology, manifold, surface.predicates)
-    pairs = np.concatenate([pairs, np.stack([inner, outer], axis=1)])
-    return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+            parts.append((manifold.kept[faces], corners, share))
+        faces, corners, share = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return faces, corners, share

@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
-from spt_jax.overlap.exact import ExactOverlap, ExactSurface, regions_of
+from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.exclusions import NOTHING, Exclusions, Rims, counted_intervals, judged_rims
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
 from spt_jax.overlap.rays.beam import Beam, Rays, aim
 from spt_jax.overlap.rays.crossings import cast
 from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
+from spt_jax.overlap.surface import ExactSurface, regions_of
 from spt_jax.overlap.triangles.pairs import Entangled
 
 Directions = tuple[tuple[float, float, float], ...]

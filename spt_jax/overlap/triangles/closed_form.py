@@ -111,7 +111,7 @@ def shares_of(
         if times is not None:
             steps *= times[contours.pair[:, 1 - own], None]
         sums += summed(at, steps, len(found))
-    sound = (np.abs(sums[:, 3:]) < _GAP).all(axis=1)
+    sound = np.abs(sums[:, 3:]).max(axis=1, initial=0.0) < _GAP
     sound[row[contours.pair[~contours.whole]]] = False
     share = sums[:, :3]
     if times is not None:

@@ -302,7 +302,8 @@ def _straddling(predicates: Predicates, layout: Layout, t, u):
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         plane, corner = layout.corners.take(y, axis=1), layout.corners.take(x, axis=1)
-        side, _ = predicates.volume(*np.tile(plane, 3), corner.ravel())
+        key = np.tile(y, 3) * predicates.points.shape[1] + corner.ravel()
+        side, _ = predicates.volume(np.tile(plane, 3), corner.ravel(), key)
         kept = np.flatnonzero(np.abs(side.reshape(3, -1).sum(axis=0)) < 3)
         t, u = t[kept], u[kept]
     return t, u
@@ -319,14 +320,14 @@ def _edges_of_pairs(topology: Topology, layout: Layout, t, u):
 def _decide(predicates: Predicates, topology: Topology, layout: Layout, row, slot):
     """The candidates that cross, what part of the edge lies before the crossing, and the jump."""
     corners, ends = layout.corners.take(slot, axis=1), topology.ends.take(row, axis=0).T
-    side, height = (x.reshape(2, -1) for x in predicates.volume(*np.tile(corners, 2), ends.ravel()))
+    side, height = (x.reshape(2, -1) for x in predicates.volume(np.tile(corners, 2), ends.ravel()))
     kept = np.flatnonzero(side[0] != side[1])
     row, slot, side, height = row[kept], slot[kept], side[0, kept], height[:, kept]
     corners, ends = corners[:, kept], ends[:, kept]
     # The edge passes on one side of all three of the triangle's.
     start, end = corners.ravel(), corners[[1, 2, 0]].ravel()
-    turn, _ = predicates.volume(*np.tile(ends, 3), start, end)
+    turn, _ = predicates.volume(np.stack([*np.tile(ends, 3), start]), end)
     kept = np.flatnonzero(np.abs(turn.reshape(3, -1).sum(axis=0)) == 3)
-    part = predicates.part_before(*corners[:, kept], *ends[:, kept], np.abs(height[:, kept]))
+    part = predicates.part_before(corners[:, kept], ends[:, kept], np.abs(height[:, kept]))
     jump = side[kept] * layout.sense[slot[kept]].astype(np.int64)
     return row[kept], slot[kept], part, jump

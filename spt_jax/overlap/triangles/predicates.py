@@ -34,6 +34,9 @@ _LEAST = 2.0**-900
 # Heights of both ends below this many times what rounding may add are worked out exactly.
 _POOR = 2.0**16
 
+# So many undecided signs are worth a search for those that are asked for again.
+_MANY = 2000
+
 # Of the pushes: a step along the normal, and what is added to tell equal ones apart.
 _STEP, _NOISE = 2.0**40, 2.0**28
 
@@ -80,20 +83,23 @@ class Predicates:
             depth += self._part / (1.0 + self._part.max(initial=0))
         return np.rint(-_STEP * (depth[:, None] * normal).T) + np.rint(_NOISE * _noise(count))
 
-    def volume(self, a, b, c, d) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-        """Signs of the volumes of tetrahedra, positive where d is on the side of abc's normal.
+    def volume(self, base, apex, key=None) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """Signs of tetrahedra's volumes, positive where the apex is on the base's normal's side.
 
         Args:
-            a, b, c, d: vertices, four different ones in each tetrahedron.
+            base: (3, N), the vertices of each tetrahedron's base.
+            apex: (N), its fourth vertex, different from those.
+            key: numbers that are the same for the same tetrahedra, where many are asked for again.
 
         Returns:
             The signs, +1 or -1, and six times the volumes: to rounding, and 0.0 where they vanish.
         """
-        origin = self.points.take(a, axis=1)
-        u, v, w = (self.points.take(x, axis=1) - origin for x in (b, c, d))
+        corners = (*base, apex)
+        origin = self.points.take(base[0], axis=1)
+        u, v, w = (self.points.take(x, axis=1) - origin for x in corners[1:])
         value = _determinant(u, v, w)
         bound = _BOUND * (_largest(u) * _largest(v) * _largest(w)) + _LEAST
-        return self._decided(value, bound, (a, b, c, d), (0, 1, 2))
+        return self._decided(value, bound, corners, (0, 1, 2), key)
 
     def area(self, a, b, c, axes: tuple[int, int]) -> Int[np.ndarray, "N"]:
         """Signs of the areas of triangles seen along an axis: +1 counter-clockwise, -1 clockwise.
@@ -109,14 +115,15 @@ class Predicates:
         bound = _BOUND * (_largest(u) * _largest(v)) + _LEAST
         return self._decided(value, bound, (a, b, c), axes)[0]
 
-    def part_before(self, a, b, c, p, q, height) -> Float[np.ndarray, "N"]:
-        """What part of each edge pq lies before its crossing of the triangle abc.
+    def part_before(self, triangle, edge, height) -> Float[np.ndarray, "N"]:
+        """What part of each edge lies before its crossing of a triangle.
 
         Args:
-            a, b, c: corners of a triangle that the edge passes through.
-            p, q: the edge's ends.
+            triangle: (3, N), corners of a triangle that the edge passes through.
+            edge: (2, N), the edge's ends.
             height: (2, N), how far the two are from the plane, times twice the triangle's area.
         """
+        (a, b, c), (p, q) = triangle, edge
         origin = self.points.take(a, axis=1)
         largest = [_largest(self.points.take(x, axis=1) - origin) for x in (b, c, p, q)]
         bound = _BOUND * largest[0] * largest[1] * np.maximum(largest[2], largest[3]) + _LEAST
@@ -136,10 +143,14 @@ class Predicates:
             part[flat] = _middle_within(*corners)
         return np.clip(part, 0.0, 1.0)
 
-    def _decided(self, value, bound, corners, axes):
+    def _decided(self, value, bound, corners, axes, key=None):
         open_ = np.flatnonzero(np.abs(value) <= bound)
         sign = np.where(value < 0, -1, 1)
-        if len(open_):
+        if len(open_) > _MANY and key is not None:
+            _, first, at = np.unique(key[open_], return_index=True, return_inverse=True)
+            found = self._exactly([x[open_[first]] for x in corners], axes)
+            sign[open_], value[open_] = (x[at] for x in found)
+        elif len(open_):
             corners = [np.broadcast_to(x, value.shape)[open_] for x in corners]
             sign[open_], value[open_] = self._exactly(corners, axes)
         return sign, value

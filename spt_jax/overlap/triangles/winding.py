@@ -226,7 +226,8 @@ def enclosing_parts(
     seen, at, sign = _rays(predicates, topology.faces, extreme, names, of_face)
     key, of = np.unique(names[seen] * manifold.num_parts + of_face[at], return_inverse=True)
     within = np.bincount(of, sign, len(key)) != 0
-    return tuple(np.divmod(key[within], manifold.num_parts))
+    inner, outer = np.divmod(key[within], manifold.num_parts)
+    return inner, outer
 
 
 def _extremes(topology: Topology, manifold: Manifold, predicates: Predicates):
@@ -257,9 +258,9 @@ def _roots(topology: Topology, manifold: Manifold, predicates: Predicates, layer
     row, end = _outermost_edges(topology, predicates, extreme)
     one, other = topology.halves[row].T
     across = faces[other // 3, other % 3]
-    corners = faces[one // 3].T
+    corners = faces[one // 3]
     # Seen from the edge, the part lies within the wedge of its two triangles: is it solid?
-    side, _ = predicates.volume(*corners, across)
+    side, _ = predicates.volume(corners.T, across)
     inverted = side > 0
     root = _Root(names, row, end)
     own = layers(names, names)
@@ -327,7 +328,7 @@ def _rays(predicates: Predicates, faces, vertex, part, part_of_face):
     turn = predicates.area(np.tile(vertex[ray], 3), start, end, (1, 2)).reshape(3, -1)
     kept = np.flatnonzero(np.abs(turn.sum(axis=0)) == 3)
     ray, face, turn = ray[kept], face[kept], turn[0, kept]
-    side, _ = predicates.volume(*faces[face].T, vertex[ray])
+    side, _ = predicates.volume(faces[face].T, vertex[ray])
     # Counter-clockwise, the triangle faces along the ray: it is ahead of a vertex behind it.
     ahead = np.flatnonzero(side == -turn)
     return ray[ahead], face[ahead], turn[ahead]
