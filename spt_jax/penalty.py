@@ -264,6 +264,9 @@ def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
         value = np.mean(found.labels(options.rule) != 0)
     if with_gradient:
         gradient = found.gradient(options.gradient, options.rule)
-    if not (np.isfinite(value) and np.isfinite(gradient).all()):  # coordinates near overflow
+    # Coordinates near overflow: measured in float64, and more than the vertices' dtype can hold.
+    narrow = options.rounding > np.finfo(np.float64).eps
+    most = float(np.finfo(np.float32 if narrow else np.float64).max)
+    if not (abs(value) <= most and (np.abs(gradient) <= most).all()):
         return np.array(np.nan), np.zeros_like(vertices)
     return value, gradient
