@@ -56,7 +56,7 @@ def scenes(first: int, count: int, seed: int) -> Iterator[Scene]:
     body, mocap = load_body(), load_mocap()
     order = np.random.default_rng(seed).permutation(len(mocap.names))
     faces = np.asarray(body.faces, np.int64)
-    graph = RestGraph.of(np.asarray(body.template, np.float64), faces)
+    graph = RestGraph.of_body(body)
     found = 0
     for frame in order:
         scene = _scene(body, mocap.names[frame], mocap.pose[frame], (seed, int(frame)))

@@ -64,6 +64,43 @@ def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, faces: Any) 
     return Exclusions(groups.astype(np.int64).tobytes(), pairs, folds)
 
 
+def as_fold_surface(body: Any, fold_distance: Any) -> RestSurface:
+    """The rest surface that tells a body's folds: its own, or with one distance everywhere.
+
+    Args:
+        body: a `BodyModel`.
+        fold_distance: in metres; None for the body's own distances, place by place.
+
+    Raises:
+        TypeError, ValueError: a distance that is no number, negative or not finite.
+    """
+    distance = as_fold_distance(fold_distance)
+    return body.rest_surface if distance is None else body.rest_surface.within(distance)
+
+
+def as_fold_distance(fold_distance: Any) -> float | None:
+    """A distance along the rest surface, or None.
+
+    Raises:
+        TypeError, ValueError: no number, negative or not finite.
+    """
+    if fold_distance is None:
+        return None
+    if isinstance(fold_distance, bool) or not isinstance(
+        fold_distance, (int, float, np.integer, np.floating)
+    ):
+        raise TypeError(
+            f"fold_distance must be a number of metres or None: got {fold_distance!r}; 0.3 suits "
+            "trunk and limbs."
+        )
+    if not 0 <= fold_distance < np.inf:
+        raise ValueError(
+            f"fold_distance must be finite and not negative: got {fold_distance!r}; 0.3 m suits "
+            "trunk and limbs."
+        )
+    return float(fold_distance)
+
+
 def _as_pairs(ignore_groups: Any) -> tuple[tuple[int, int], ...]:
     try:
         pairs: np.ndarray = np.asarray(

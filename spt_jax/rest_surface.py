@@ -8,7 +8,8 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.arguments import check_indices
-from spt_jax.overlap.exact import parts_in_each_other
+from spt_jax.local_thickness import local_radii
+from spt_jax.overlap.surface import parts_in_each_other
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.surface_paths import MOST_PIECES, SurfacePaths, surface_paths
 
@@ -42,7 +43,7 @@ class RestSurface:
         rest_vertices: positions of the mesh at rest, where it does not overlap itself.
         faces: indices of each triangle's corners.
         distance: one number, or one for each face. 0.3 m tells arms from the trunk and keeps
-            armpits and elbows together; fingers want 2 to 4 cm (`body.rest_surface` has both), and
+            armpits and elbows together; fingers want 4 to 5 cm (`body.rest_surface` has both), and
             `local_distances(vertices, faces)` finds some for any mesh.
 
     Raises:
@@ -181,6 +182,8 @@ class RestSurface:
     ) -> Bool[np.ndarray, "N"]:
         """Whether triangles lie nearer to each other than the smaller of their distances.
 
+        Or in parts of the surface that lie in each other at rest.
+
         Args:
             f, g: the pairs, as indices of faces.
             exact: decide by the distance itself, not by `between_faces`. Bounds over the nearest
@@ -189,14 +192,14 @@ class RestSurface:
                 embedded body take about 9 ms at first and 0.7 ms again, and of 180,000 none is
                 wrong; by `between_faces`, 1.3 % of them would be.
         """
+        near = self.overlap_at_rest(f, g)
         if len(self._levels) == 1:
-            return self._nearer(f, g, self.distance, exact)
+            return near | self._nearer(f, g, self.distance, exact)
         level = self._level_of_faces
         of_pair = np.minimum(*(level[x % len(level)] for x in (f, g)))
-        near = np.zeros(len(f), bool)
         for number in np.unique(of_pair):
             at = np.flatnonzero(of_pair == number)
-            near[at] = self._nearer(f[at], g[at], self._levels[number], exact)
+            near[at] |= self._nearer(f[at], g[at], self._levels[number], exact)
         return near
 
     def _nearer(self, f, g, distance: float, exact: bool):
@@ -211,6 +214,11 @@ class RestSurface:
             near[undecided] = self._paths.near(f, g, distance)
         return near
 
+    @property
+    def parts_at_rest(self) -> tuple[Int[np.ndarray, "F"], Int[np.ndarray, "N 2"]]:
+        """Of one copy, each face's connected part, and pairs of parts that lie in each other."""
+        return _rest_parts(self._paths.content)
+
     def overlap_at_rest(
         self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
     ) -> Bool[np.ndarray, "N"]:
@@ -218,7 +226,7 @@ class RestSurface:
 
         They are meant to: eyeballs in a head, teeth in a jaw. Parts of different copies do not.
         """
-        part, pairs = _rest_parts(self._paths.content)
+        part, pairs = self.parts_at_rest
         if not len(pairs):
             return np.zeros(np.broadcast_shapes(np.shape(f), np.shape(g)), bool)
         count = len(part)
@@ -237,9 +245,49 @@ class RestSurface:
         return lower, upper
 
 
+def local_distances(rest_vertices: Any, faces: Any, girths: float = 0.8) -> Float[np.ndarray, "F"]:
+    """For each triangle of any mesh a distance to tell folds by, from how thick the solid is there.
+
+    The distance is a part of the girth, 2 pi r, of the largest ball that touches the surface there
+    from inside; tips and edges are as thick as what they are the tips of (a quarter of the way to
+    it is taken from r). A cylinder of radius r has pi r with girths=0.5, which is enough where
+    limbs are round and skin slides as it does. Linear blend skinning, and limbs that are flatter
+    than round, fold farther: with 0.8, 40 mocap frames and 41 poses of hands on the embedded body
+    give the verdicts that `body.rest_surface` gives, with 0.65 three of the frames that only fold
+    count, with 0.5 seven.
+
+    An open sheet has no inside: it is as thick as it is large. 24,540 triangles take 0.5 s.
+
+    Args:
+        rest_vertices: positions of the mesh at rest, where it does not overlap itself.
+        faces: indices of each triangle's corners, counter-clockwise seen from outside.
+        girths: how much of the girth.
+
+    Returns:
+        One distance for each triangle, in the vertices' unit, for `RestSurface(rest_vertices,
+        faces, distance)` or `rest_surface.within(distance)`.
+
+    Raises:
+        TypeError: an array has the wrong kind of dtype or is traced; girths is no number.
+        ValueError: an array's shape or an index is wrong, a position is not finite, or girths is
+            not finite or negative.
+
+    Example:
+        >>> import trimesh
+        >>> from spt_jax.rest_surface import RestSurface, local_distances
+        >>> torus = trimesh.creation.torus(1.0, 0.2)
+        >>> distance = local_distances(torus.vertices, torus.faces, girths=0.5)
+        >>> RestSurface(torus.vertices, torus.faces, distance)
+        RestSurface(2048 faces, distance=0.62 to 0.628)
+    """
+    vertices, corners = _as_surface(rest_vertices, faces)
+    share = _as_number("girths", girths, "0.8 suits skinned bodies")
+    radius = local_radii(vertices, corners, surface_paths(vertices, corners).graph)
+    return 2 * np.pi * share * radius[corners].max(axis=1, initial=0.0)
+
+
 @functools.lru_cache(maxsize=4)
 def _rest_parts(content):
-    """The connected part of each face, and the pairs of parts that lie in each other."""
     manifold = manifold_of(content.faces, len(content.vertices))
     of_face = np.zeros(len(content.faces), np.int64)
     of_face[manifold.beside] = manifold.part[manifold.faces[:, 0]]
@@ -281,7 +329,7 @@ def _as_surface(rest_vertices: Any, faces: Any):
 def _as_distances(distance: Any, count: int) -> tuple[tuple[float, ...], bytes]:
     """The different distances, ascending, and which of them each face has, for hashing."""
     if np.ndim(distance) == 0:
-        return (_as_distance(distance),), b""
+        return (_as_number("distance", distance, "0.3 m suits a body"),), b""
     if isinstance(distance, Tracer):
         raise TypeError("distance must be known when traced: got a traced array; use NumPy.")
     given = np.asarray(distance)
@@ -309,15 +357,9 @@ def _as_distances(distance: Any, count: int) -> tuple[tuple[float, ...], bytes]:
     return kept, level.astype(np.uint8).tobytes() if len(kept) > 1 else b""
 
 
-def _as_distance(distance: Any) -> float:
-    if isinstance(distance, bool) or not isinstance(
-        distance, (int, float, np.integer, np.floating)
-    ):
-        raise TypeError(
-            f"distance must be a number: got {distance!r}; pass a float, in the vertices' unit."
-        )
-    if not 0 <= distance < np.inf:
-        raise ValueError(
-            f"distance must be finite and not negative: got {distance!r}; 0.3 m suits a body."
-        )
-    return float(distance)
+def _as_number(name: str, value: Any, advice: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{name} must be a number: got {value!r}; pass a float, and {advice}.")
+    if not 0 <= value < np.inf:
+        raise ValueError(f"{name} must be finite and not negative: got {value!r}; {advice}.")
+    return float(value)

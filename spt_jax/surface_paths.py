@@ -58,6 +58,7 @@ class SurfacePaths:
     Attributes:
         content: the mesh.
         faces: its triangles.
+        graph: the lengths of its edges, symmetric.
         pieces: how many parts without a common vertex they make.
     """
 
@@ -67,8 +68,8 @@ class SurfacePaths:
         corners = content.vertices[self.faces]
         edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         self._longest = edges.max(axis=1, initial=0.0).astype(np.float32)
-        self._graph = _edge_graph(content.vertices, self.faces)
-        labels = scipy.sparse.csgraph.connected_components(self._graph, directed=False)[1]
+        self.graph = _edge_graph(content.vertices, self.faces)
+        labels = scipy.sparse.csgraph.connected_components(self.graph, directed=False)[1]
         self.pieces = len(np.unique(labels[self.faces[:, 0]]))
         self._lock = threading.Lock()
         self._table: _Table | None = None
@@ -132,7 +133,7 @@ class SurfacePaths:
 
     def _from_faces(self, sources, limit):
         """Distances from a few faces to all; infinite beyond the limit."""
-        graph = self._graph
+        graph = self.graph
         # Each source is a node behind the vertices, with ways out to its corners and none in.
         ways = graph.nnz + 3 * np.arange(1, len(sources) + 1)
         vertices = len(self.content.vertices)
@@ -155,7 +156,7 @@ class SurfacePaths:
         if table is None:
             with self._lock:
                 table = self._table = self._table or _Table(
-                    self._graph, self.faces, self._longest, self.pieces
+                    self.graph, self.faces, self._longest, self.pieces
                 )
         return table
 

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import join, moved, random_rotation, sphere
+from helpers import bent_tube, box, embedded_body, join, moved, random_rotation, sphere
 from helpers_device import SOLIDS, padded
 
-from spt_jax import self_intersection_penalty
+from spt_jax import RestSurface, self_intersection_penalty
+from spt_jax.device.exclusions import _folds, _near_at_rest
 from spt_jax.device.pair_search import over_crossing_pairs
 from spt_jax.device.patches import spread
 from spt_jax.device.triangle_pairs import cross_each_other
@@ -31,6 +32,63 @@ def test_groups_as_on_the_host():
     np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-5 * scale)
     value, gradient = both(*padded("two boxes", "float32"), "xla")
     assert value == 0 and not gradient.any()
+
+
+def test_what_is_near_depends_on_where(rng):
+    """By the smaller of two distances, or as parts that lie in each other at rest."""
+    tube = bent_tube(0.5, 0.2, 0.1, sides=10, steps=30)
+    inner = box((0.05, 0.05, 0.05), tube[0][10:20].mean(axis=0))
+    mesh = join(tube, inner, moved(inner, translation=(5.0, 0.0, 0.0)))
+    allowed = rng.choice([0.1, 0.4, 1.0], len(mesh[1]))
+    rest = RestSurface(*mesh, allowed)
+    assert len(rest.parts_at_rest[1]) == 1
+    for folds in (rest, rest.copies(2), RestSurface(*tube, 0.4)):
+        f, g = rng.integers(0, folds.num_faces, (2, 20000))
+        expected = folds.near(f, g, exact=True)
+        pair = jnp.asarray(f, "int32"), jnp.asarray(g, "int32")
+        found = np.asarray(_near_at_rest(folds, *pair))
+        assert 0.01 < expected.mean() < 0.9 and np.mean(found != expected) < 0.005
+        along = folds.between_faces(f, g)
+        same = np.asarray(_folds(folds, *pair, jnp.asarray(along, "float32")))
+        np.testing.assert_array_equal(same, folds.near(f, g))
+
+
+def test_fingers_are_near_exactly(rng):
+    """Where seeds are farther away than folds reach; between two bodies nothing is near."""
+    body = embedded_body()
+    fingers = np.flatnonzero(body.rest_surface.distances < 0.1)
+    f, g = rng.choice(fingers, (2, 20000))
+    f[::4] = rng.integers(0, len(body.faces), len(f[::4]))
+    expected = body.rest_surface.near(f, g, exact=True)
+    assert 0.02 < expected.mean() < 0.5
+    for rest, shift in ((body.rest_surface, 0), (body.rest_surface.copies(2), len(body.faces))):
+        pair = jnp.asarray(f + shift, "int32"), jnp.asarray(g + shift, "int32")
+        np.testing.assert_array_equal(_near_at_rest(rest, *pair), expected)
+    apart = jnp.asarray(f, "int32"), jnp.asarray(g + len(body.faces), "int32")
+    assert not _near_at_rest(body.rest_surface.copies(2), *apart).any()
+
+
+def test_what_is_enclosed_at_rest_does_not_count():
+    """Neither by rays nor exactly; what two bodies share does."""
+    eyed = join(box(), box((0.2, 0.2, 0.2), (0.05, 0.02, 0.01)))
+    rest = RestSurface(*eyed, distance=10.0)
+    scene = join(eyed, moved(eyed, translation=(0.7, 0.12, 0.08)))
+    turned = moved(scene, random_rotation(np.random.default_rng(1)))
+
+    def penalty(copies, backend, rays=64):
+        vertices, faces = jnp.asarray(turned[0][: 16 * copies], "float32"), turned[1][: 24 * copies]
+        return float(
+            self_intersection_penalty(
+                vertices, faces, rays=rays, folds=rest.copies(copies), backend=backend
+            )
+        )
+
+    exact = penalty(2, "numpy", "auto")
+    assert exact == pytest.approx(0.3 * 0.88 * 0.92, rel=1e-6)
+    assert penalty(1, "numpy", "auto") == 0
+    for backend in ("numpy", "xla"):
+        assert penalty(1, backend) == 0
+        assert penalty(2, backend) == pytest.approx(exact, rel=5e-3)
 
 
 def test_triangles_that_cross(rng):

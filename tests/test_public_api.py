@@ -55,12 +55,13 @@ PARAMETERS = {
     " upright_weight=0.25, expected_error=None, robust=None, starts=6, solver=None,"
     " keypoint_solver=None, max_steps=20",
     "fit_people": "body, keypoints, camera, *, joints, weights=(0.01, 0.1, 1.0, 10.0, 100.0),"
-    " margin=0.002, max_steps=25, **options",
+    " margin=0.002, fold_distance=None, max_steps=25, **options",
     "keypoint_regressor": "body, joints, *, count=None, names=None",
     "read_keypoints": "path, *, layout=None",
     "load_body": "source='anny', *, num_shape=10, dtype=None",
     "load_mocap": "",
-    "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore', margin=0.002,"
+    "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
+    " fold_distance=None, margin=0.002,"
     " rays='auto', directions=3, weights=(0.01, 0.1, 1.0, 10.0, 100.0), steps_per_weight=25,"
     " tolerance=1e-09, solver=None, on_step=None",
 }

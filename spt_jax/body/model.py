@@ -105,7 +105,7 @@ class BodyModel(eqx.Module):
         """The body's surface at rest, in the mean shape: what the penalty tells folds by.
 
         Triangles that intersect nearer to each other along it than what lies there allows fold:
-        0.3 m on trunk and limbs, 2 to 4 cm on fingers, from the girth of what each joint moves
+        0.3 m on trunk and limbs, 4 to 5 cm on fingers, from the girth of what each joint moves
         (`spt_jax.body.fold_distances`). `body.rest_surface.within(0.2)` is for one distance
         everywhere, and `within(array)` for one a face.
 
@@ -116,7 +116,7 @@ class BodyModel(eqx.Module):
         Example:
             >>> from spt_jax.body import load_body
             >>> load_body().rest_surface
-            RestSurface(24540 faces, distance=0.033 to 0.3)
+            RestSurface(24540 faces, distance=0.0395 to 0.3)
         """
         traced = (self.template, self.faces, self.weights, self.joint_template)
         if any(isinstance(array, Tracer) for array in traced):

@@ -1,0 +1,33 @@
+"""The earlier tree's side of `benchmarks.folds`: volumes with folds left out, of files of meshes.
+
+It imports the tree that it is given, not its own, and uses nothing but the public API.
+"""
+
+import json
+import sys
+import time
+
+import numpy as np
+
+sys.path.insert(0, sys.argv[1])
+
+import spt_jax
+
+
+def main() -> None:
+    """Answer each line of standard input, an .npz file, with [volumes, seconds a mesh]."""
+    if not str(spt_jax.__file__).startswith(sys.argv[1]):
+        sys.exit(f"spt_jax must be imported from {sys.argv[1]}: got {spt_jax.__file__}.")
+    body = spt_jax.load_body()
+    faces, rest = np.asarray(body.faces), body.rest_surface
+    spt_jax.intersection_report(np.asarray(body.template), faces, folds=rest)
+    for line in sys.stdin:
+        meshes = np.load(line.strip())["vertices"]
+        start = time.perf_counter()
+        found = [spt_jax.intersection_report(v, faces, folds=rest).volume for v in meshes]
+        taken = (time.perf_counter() - start) / len(meshes)
+        print(json.dumps([[float(volume) for volume in found], taken]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
