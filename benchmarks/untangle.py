@@ -50,13 +50,15 @@ class Frame(NamedTuple):
     steps: int
     seconds: float
     finite: bool
+    free: bool
+    reason: str
 
 
 @cache
 def _world():
     body, mocap = load_body(), load_mocap()
     faces = np.asarray(body.faces, np.int64)
-    return body, mocap, faces, RestGraph.of(np.asarray(body.template, np.float64), faces)
+    return body, mocap, faces, RestGraph.of_body(body)
 
 
 def untangled(index: int) -> tuple[Frame, np.ndarray, np.ndarray]:
@@ -81,6 +83,8 @@ def untangled(index: int) -> tuple[Frame, np.ndarray, np.ndarray]:
         steps=int(result.steps),
         seconds=seconds,
         finite=bool(np.isfinite(freed).all() and np.isfinite(np.asarray(result.pose)).all()),
+        free=bool(result.free),
+        reason=result.reason,
     )
     return frame._replace(after=frame.before if frame.after < 0 else frame.after), vertices, freed
 
@@ -114,6 +118,12 @@ def tables(frames: list[Frame]) -> list[Table]:
                 f"{WITHIN * 1e3:g} mm",
             ),
             ("the others did not move at all", f"{unmoved} of {len(others)}", "all"),
+            (
+                "free by its own account, and by ipctk",
+                f"{sum(frame.free for frame in frames)}, "
+                f"{sum(frame.free and not frame.after for frame in frames)}",
+                "the same",
+            ),
             ("a value is not finite", str(sum(not frame.finite for frame in frames)), "0"),
         ],
     )
@@ -128,7 +138,15 @@ def tables(frames: list[Frame]) -> list[Table]:
     )
     listed = Table(
         "Frames that did not come free",
-        ("frame", "far crossings before", "after", "volume before, cm^3", "after", "moved, mm"),
+        (
+            "frame",
+            "far crossings before",
+            "after",
+            "volume before, cm^3",
+            "after",
+            "moved, mm",
+            "how it ended",
+        ),
         [
             (
                 f.name,
@@ -137,6 +155,7 @@ def tables(frames: list[Frame]) -> list[Table]:
                 f"{1e6 * f.volume:.1f}",
                 f"{1e6 * f.left:.3f}",
                 f"{1e3 * f.moved:.1f}",
+                f.reason.split(".")[0],
             )
             for f in failures
         ],

@@ -52,8 +52,11 @@ def main(settings: Settings) -> None:
                     1e6 * result.after.volume,
                     result.before.crossings,
                     shift.max(),
+                    1e2 * result.relative_displacement,
                     shift[shift > 0].mean() if shift.any() else 0.0,
                     result.moved,
+                    result.flipped_triangles,
+                    result.inverted_parts,
                     result.steps,
                     seconds,
                 )
@@ -63,10 +66,13 @@ def main(settings: Settings) -> None:
     names = (
         "volume before, cm^3",
         "volume after, cm^3",
-        "crossings before",
+        "intersecting pairs before",
         "largest displacement, mm",
+        "the same against the body's size, %",
         "mean displacement of what moves, mm",
         "vertices moved",
+        "triangles turned over",
+        "parts turned inside out",
         "steps",
         "seconds",
     )

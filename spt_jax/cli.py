@@ -21,8 +21,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
     0: done. 1: `check` found a self-intersection, `untangle` left one in a mesh, or `fit` could not
-    fit somebody. 2: the input or the output folder is at fault, said in one line on the standard
-    error stream. 130: interrupted.
+    fit somebody. 2: the input or the output folder is at fault, or a surface is none that could be
+    measured, said in one line on the standard error stream. 130: interrupted.
 
     Args:
         args: the words after `spt-jax`; those of the process if None.
@@ -37,6 +37,14 @@ def main(args: Sequence[str] | None = None) -> int:
         )
     except CommandError as error:
         print(f"spt-jax: {error}", file=sys.stderr)
+        return 2
+    except ValueError as error:
+        # Imported here: not every command measures something.
+        from spt_jax.overlap.measure import Unmeasurable
+
+        if not isinstance(error, Unmeasurable):
+            raise
+        print(f"spt-jax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("spt-jax: interrupted; no file is left half-written", file=sys.stderr)

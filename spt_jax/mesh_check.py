@@ -192,7 +192,8 @@ def one_mesh(vertices, faces, counting: bool = False) -> tuple[np.ndarray, np.nd
     # An empty list of faces has NumPy's default dtype and no columns; it is still no faces.
     if triangles.size == 0 and not isinstance(faces, np.ndarray | Array):
         triangles = np.zeros((0, 3), np.int64)
-    as_mesh(points, np.zeros_like(triangles) if counting and len(points) else triangles)
+    with np.errstate(over="ignore"):  # 1e300 is no float32, which JAX wants by default
+        as_mesh(points, np.zeros_like(triangles) if counting and len(points) else triangles)
     if points.ndim != 2:
         raise ValueError(
             f"vertices must be one mesh of shape (V, 3): got {points.shape}; take the meshes of a "

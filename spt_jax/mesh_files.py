@@ -15,6 +15,10 @@ BODY_COLOUR = (213, 201, 188)
 OUT_COLOUR = (222, 58, 24)
 IN_COLOUR = (0, 114, 178)
 
+# What rounding to float32 may move vertices by, against the size of the mesh, and not be seen: near
+# the origin it does by a tenth of that.
+_MOST_ROUNDING = 1e-6
+
 # Formats that cannot share a vertex between triangles, or that split it along texture and normal
 # seams. The others (PLY, OFF, ...) index their vertices, so their topology is taken as it stands.
 _SPLIT_FORMATS = frozenset({".stl", ".obj", ".glb", ".gltf", ".dae", ".3mf"})
@@ -28,8 +32,10 @@ def write_mesh(
 ) -> None:
     """Write a mesh as .glb or .ply, atomically, with one colour a vertex that other programs show.
 
-    V_0 is warm grey, V_out (+1) vermillion, V_in (-1) blue. Both formats store float32 positions.
-    glTF defines vertex colours as linear light, so a .glb holds the same colours linearised.
+    V_0 is warm grey, V_out (+1) vermillion, V_in (-1) blue. A .ply stores positions as float32
+    where that holds all of them exactly, else as float64. A .glb, which knows float32 alone, stores
+    them so; of a mesh far from the origin about its middle, and that as a node's translation. glTF
+    defines vertex colours as linear light, so a .glb holds the same colours linearised.
 
     Args:
         path: the file; its suffix chooses the format.
@@ -54,7 +60,6 @@ def write_mesh(
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
-    from trimesh.exchange.ply import export_ply
 
     suffix = Path(path).suffix.lower()
     if suffix not in (".glb", ".ply"):
@@ -64,11 +69,16 @@ def write_mesh(
     if suffix == ".glb":
         colours = _linear_light(colours)
     rgba = np.concatenate([colours, np.full((len(colours), 1), 255, np.uint8)], axis=1)
-    mesh = trimesh.Trimesh(points, triangles, vertex_colors=rgba, process=False)
     if suffix == ".glb":
-        content = export_glb(trimesh.Scene(mesh), tree_postprocessor=_add_light_material)
+        middle = np.eye(4)
+        if not fits_single(points):
+            middle[:3, 3] = (points.min(axis=0) + points.max(axis=0)) / 2
+        mesh = trimesh.Trimesh(points - middle[:3, 3], triangles, vertex_colors=rgba, process=False)
+        scene = trimesh.Scene()
+        scene.add_geometry(mesh, transform=middle)
+        content = export_glb(scene, tree_postprocessor=_add_light_material)
     else:
-        content = export_ply(mesh)
+        content = _as_ply(points, triangles, rgba)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 
@@ -185,6 +195,19 @@ def as_mesh_arrays(
     return points.astype(np.float64), triangles.astype(np.int64), classes.astype(np.int8)
 
 
+def single_rounding(vertices: Float[np.ndarray, "V 3"]) -> float:
+    """How far float32 moves a coordinate at most; 0 where it holds all of them exactly."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.abs(vertices.astype(np.float32) - vertices).max(initial=0.0))
+
+
+def fits_single(vertices: Float[np.ndarray, "V 3"]) -> bool:
+    """Whether float32 moves vertices by so little that nobody sees it."""
+    with np.errstate(invalid="ignore"):
+        size = np.ptp(vertices, axis=0).max(initial=0.0)
+    return bool(single_rounding(vertices) <= _MOST_ROUNDING * size)
+
+
 def _read_obj(file: Path) -> tuple[np.ndarray, np.ndarray]:
     # trimesh 5.2 groups an .obj by material and splits it by texture coordinate, which loses the
     # order of the vertices; the file itself indexes positions apart from both.
@@ -224,6 +247,26 @@ def _close_seams(
     collapsed = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
     collapsed &= ~(faces == np.roll(faces, 1, axis=1)).any(axis=1)
     return vertices[kept], joined[~collapsed]
+
+
+def _as_ply(points: np.ndarray, triangles: np.ndarray, rgba: np.ndarray) -> bytes:
+    # trimesh 5.2 writes float32 whatever it is given.
+    number, name = ("<f8", "double") if single_rounding(points) else ("<f4", "float")
+    corners = np.empty(len(points), [("position", number, 3), ("colour", "u1", 4)])
+    corners["position"], corners["colour"] = points, rgba
+    faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property {name} {axis}" for axis in "xyz"),
+        *(f"property uchar {part}" for part in ("red", "green", "blue", "alpha")),
+        f"element face {len(triangles)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(header) + "\n").encode() + corners.tobytes() + faces.tobytes()
 
 
 def _linear_light(colours: np.ndarray) -> np.ndarray:

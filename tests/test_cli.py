@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from helpers_body import synthetic_smpl
 
+from spt_jax import cli
 from spt_jax.body import load_mocap
 from spt_jax.body.pose_files import read_poses, write_poses
 from spt_jax.cli import main
@@ -31,7 +32,9 @@ def calls(monkeypatch):
         on_step(np.int32(1), np.int32(2), np.float32(1e-6))
         pose = 0.05 * pose
         vertices = body(pose, shape, translation).vertices
-        return SimpleNamespace(pose=pose, vertices=vertices, steps=np.int32(7))
+        return SimpleNamespace(
+            pose=pose, vertices=vertices, steps=np.int32(7), free=np.bool_(True), reason="free"
+        )
 
     replace_untangle_pose(monkeypatch, stand_in)
     return made
@@ -88,6 +91,8 @@ def test_demo_without_pictures(calls, tmp_path, capsys, monkeypatch):
     assert "The picture was left out: pictures need pyvista" in captured.err
     assert "spt-jax[viz]" in captured.err
     assert "punch/0013" in captured.out and "cm³" in captured.out and "\x1b" not in captured.out
+    # Nothing is left out: the skin is freed of its folds, too.
+    assert "left out as folds: 0.00 cm³ and 0 pairs before" in captured.out
 
     report = json.loads((folder / "report.json").read_text())
     assert report["picture"] is None and "pyvista" in report["picture_left_out"]
@@ -97,6 +102,7 @@ def test_demo_without_pictures(calls, tmp_path, capsys, monkeypatch):
     for frame in report["frames"]:
         assert frame["before"]["volume"] > 1e-5 > frame["after"]["volume"]
         assert frame["steps"] == 7 and frame["seconds"] > 0
+        assert frame["free"] and frame["reason"] == "free"
     poses = read_poses(folder / "poses.npz")
     assert poses.names == list(DEMO_FRAMES[:2]) and poses.pose.shape == (2, 52, 3)
     np.testing.assert_allclose(poses.pose, [0.05 * call["pose"] for call in calls])
@@ -184,11 +190,17 @@ def test_untangle_of_chosen_frames(calls, tmp_path, capsys):
     assert main([*words, "--meshes"]) == 0
     text = capsys.readouterr().out
     assert "punch/0013" in text and "run/0018" not in text and "6 meshes" in text
+    assert "3 frames, 3 free: " in text
+    (line,) = [line for line in text.splitlines() if line.startswith("left out as folds: ")]
     assert read_poses(out / "poses.npz").names == ["punch/0013", "walk/0005", "walk/0006"]
     assert [call["rays"] for call in calls] == [64] * 3  # half of what the report is made with
     assert len(list(out.glob("*.glb"))) == 6
     report = json.loads((out / "report.json").read_text())
     assert report["settings"]["rays"] == 128 and len(report["meshes"]) == 6
+    counts = [frame["before"]["crossing_pairs"] for frame in report["frames"]]
+    pairs = sum(count["all"] - count["counted"] for count in counts)
+    volume = sum(f["before"]["total_volume"] - f["before"]["volume"] for f in report["frames"])
+    assert f"{1e6 * volume:.2f} cm³ and {pairs} pairs before, " in line and pairs > 0 < volume
 
     assert main([*words, "--json"]) == 0
     captured = capsys.readouterr()
@@ -197,6 +209,55 @@ def test_untangle_of_chosen_frames(calls, tmp_path, capsys):
         "walk/0005",
         "walk/0006",
     ]
+
+
+def test_what_is_a_fold_is_set_from_the_command_line(calls, tmp_path, capsys):
+    file = mocap_file(tmp_path / "m.npz", ["run/0005"])
+    counted = {}
+    for words in ([], ["--fold-distance", "0"], ["--fold-distance", "9"], ["--folds", "count"]):
+        assert main(["untangle", file, "--out", str(tmp_path / "out"), *words]) == 0
+        text = capsys.readouterr().out
+        report = json.loads((tmp_path / "out" / "report.json").read_text())
+        (frame,) = report["frames"]
+        found = frame["before"]["crossing_pairs"]
+        counted[" ".join(words)] = found["counted"]
+        left = found["all"] - found["counted"]
+        assert f"and {left} pairs before" in text
+        volume = 1e6 * (frame["before"]["total_volume"] - frame["before"]["volume"])
+        assert f"left out as folds: {volume:.2f} cm³" in text
+    assert [call["fold_distance"] for call in calls] == [None, 0.0, 9.0, None]
+    assert counted[""] == counted["--fold-distance 9"] == 0
+    assert counted["--fold-distance 0"] > 50 < counted["--folds count"] == found["all"]
+
+
+def test_a_pose_that_cannot_be_measured_is_named(calls, tmp_path, capsys):
+    pose = np.zeros((1, 22, 3))
+    write_poses(tmp_path / "far.npz", pose, translation=np.full((1, 3), 1e5), names=["far/away"])
+    out = tmp_path / "out"
+    assert main(["untangle", str(tmp_path / "far.npz"), "--out", str(out)]) == 2
+    seen = capsys.readouterr()
+    assert seen.err.startswith("spt-jax: far/away: vertices must not be farther from the origin")
+    assert seen.err.count("\n") == 1 and seen.out == "" and files_in(out) == []
+
+
+def test_a_surface_that_cannot_be_measured_is_one_line_wherever_it_comes_up(monkeypatch, capsys):
+    from spt_jax.overlap.measure import Unmeasurable
+
+    def fail(*_, **__):
+        raise Unmeasurable("vertices must be finite:\ngot NaN")
+
+    replace_untangle_pose(monkeypatch, fail)
+    monkeypatch.setattr("spt_jax.output_files.ensure_folder", lambda path: path)
+    assert main(["demo", "--frames", "1", "--quiet"]) == 2
+    said = "spt-jax: punch/0013: vertices must be finite: got NaN\n"
+    assert capsys.readouterr() == ("", said)
+
+    def command() -> int:
+        fail()
+
+    monkeypatch.setitem(cli._COMMANDS, "demo", command)
+    assert main(["demo"]) == 2
+    assert capsys.readouterr() == ("", "spt-jax: vertices must be finite: got NaN\n")
 
 
 def test_untangle_frees_a_real_pose(tmp_path, capsys):
@@ -251,6 +312,7 @@ def test_untangle_of_a_body_file(calls, tmp_path, capsys, rng):
         (["--frames", "1-0"], "got '1-0'"),
         (["--frames", "0,jog"], "got 'jog'; separate several by commas"),
         (["--rays", "-1"], "rays must be from 1"),
+        (["--fold-distance", "-0.1"], "fold_distance must be finite and not negative: got -0.1"),
         (["--body", "missing.npz"], "no body model file at missing.npz"),
     ],
 )

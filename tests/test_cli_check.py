@@ -22,6 +22,43 @@ def test_check_of_a_clean_mesh(tmp_path, capsys):
     assert "it does not self-intersect" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_verdict_follows_from_pairs_and_from_volume(dtype, tmp_path, capsys):
+    """Beams that meet at corners: many pairs, next to no volume, and rays that see nothing of it;
+    one in another: volume and no pairs; one on another: neither."""
+    beams = join(box((4, 0.01, 0.01)), box((0.01, 4, 0.01)), box((0.01, 0.01, 4)))
+    nested, touching = join(box(), box((0.5, 0.5, 0.5))), join(box(), box(center=(1, 0, 0)))
+    for mesh, code in ((beams, 1), (nested, 1), (touching, 0)):
+        path = tmp_path / "a.off"
+        lines = ["OFF", f"{len(mesh[0])} {len(mesh[1])} 0"]
+        lines += [" ".join(map(repr, row)) for row in mesh[0].astype(dtype).tolist()]
+        lines += [f"3 {a} {b} {c}" for a, b, c in mesh[1].tolist()]
+        path.write_text("\n".join(lines))
+        for rays in ("auto", "16"):
+            assert main(["check", str(path), "--rays", rays]) == code
+            text = capsys.readouterr().out
+            assert ("it self-intersects" in text) == bool(code)
+            assert ("it does not self-intersect" in text) == (not code)
+        assert main(["check", str(path), "--json"]) == code
+        found = json.loads(capsys.readouterr().out)["intersection"]
+        assert found["intersects"] == bool(code) and found["exact"]
+        assert (found["crossing_pairs"]["all"] > 0) == (mesh is beams)
+
+
+def test_a_mesh_whose_exact_sums_do_not_close_is_warned_of(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("spt_jax.overlap.exact.ExactOverlap.sound", property(lambda self: False))
+    mesh = write(tmp_path / "a.ply", join(box(), box(center=(0.53, 0.1, 0.2))))
+    assert main(["check", mesh]) == 1
+    seen = capsys.readouterr()
+    assert seen.err.startswith("warning: the exact sums do not close") and seen.err.count("\n") == 1
+    assert "it self-intersects" in seen.out
+    assert main(["check", mesh, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert not found["intersection"]["exact"] and "rays were cast" in found["warning"]
+    assert main(["check", mesh, "--rays", "64"]) == 1  # which were asked for
+    assert capsys.readouterr().err == ""
+
+
 def test_check_of_a_mesh_that_intersects_itself(tmp_path, capsys):
     mesh = write(tmp_path / "a.stl", join(box(), box(center=(0.53, 0.1, 0.2))))
     assert main(["check", mesh, "--rays", "64"]) == 1

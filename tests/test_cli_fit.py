@@ -11,6 +11,7 @@ import trimesh
 from helpers_body import synthetic_smpl
 from PIL import Image
 
+from spt_jax.body import load_body
 from spt_jax.body.pose_files import read_poses
 from spt_jax.cli import main
 from spt_jax.commands import fitted
@@ -233,7 +234,46 @@ def test_people_of_an_image_together(calls, tmp_path, rng, monkeypatch, capsys):
         "crossings_within": 4,
     }
     assert set(scene["after"].values()) == {0}
-    assert "2 people together" in " ".join(capsys.readouterr().out.split())
+    text = " ".join(capsys.readouterr().out.split())
+    assert "2 people together" in text
+    assert "left out as folds: 6.00 cm³ and 9 pairs of triangles" in text
+
+
+@pytest.mark.parametrize("words", [[], ["--fold-distance", "0.1"]])
+def test_what_is_a_fold_reaches_the_fit_and_the_report(
+    words, calls, tmp_path, rng, monkeypatch, capsys
+):
+    without_pictures(monkeypatch)
+    reports, scenes = [], []
+
+    def report(*_, folds):
+        reports.append(folds)
+        return Overlap
+
+    def together(body, keypoints, camera, **options):
+        scenes.append(options.pop("fold_distance"))
+        options = {name: value for name, value in options.items() if name != "robust"}
+        rows = [
+            fitting.fit_pose(body, row, camera, **options | {"confidence": trust})
+            for row, trust in zip(keypoints, options["confidence"], strict=True)
+        ]
+        people = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
+        nothing = Penetration(*(jnp.asarray(x) for x in (0.0, 0.0, 0, 0)))
+        return PeopleResult(people=people, before=nothing, after=nothing, steps=jnp.array(3))
+
+    monkeypatch.setattr("spt_jax.report.intersection_report", report)
+    monkeypatch.setattr("spt_jax.fit.people.fit_people", together)
+    people = [(1, person(rng)), (1, person(rng)), (2, person(rng))]
+    file = coco_file(tmp_path / "a.json", people, dict.fromkeys((1, 2), (640, 480)))
+    out = tmp_path / "out"
+    assert main(["fit", file, "--out", str(out), "--together", *words]) == 0
+    expected = 0.1 if words else None
+    usual = load_body().rest_surface
+    wanted = usual.within(0.1) if words else usual
+    assert scenes == [expected] and reports == [wanted] * 3
+    assert all(call["regulariser"].rest == wanted for call in calls)
+    settings = json.loads((out / "report.json").read_text())["settings"]
+    assert settings["fold_distance"] == expected
 
 
 def test_a_scene_has_one_layout():
@@ -248,8 +288,8 @@ def test_a_scene_has_one_layout():
 class Overlap:
     """In place of a report, where none is looked at."""
 
-    volume = 0.0
-    crossing_pairs = (0, 0)
+    volume, total_volume = 0.0, 2e-6
+    crossing_pairs = (0, 3)
     labels = None
 
     @staticmethod

@@ -69,6 +69,29 @@ def test_written_meshes_read_back(tmp_path, suffix):
     assert [p.name for p in tmp_path.iterdir()] == [f"a{suffix}"]
 
 
+def test_double_precision_is_kept(tmp_path):
+    """In a .ply to the bit, of meshes near the origin and far from it; in a .glb as far as its
+    float32 about the mesh's middle goes. What float32 holds is stored so."""
+    vertices, faces, _ = labelled_cube()
+    sizes = {}
+    for name, points in (
+        ("single", vertices.astype(np.float32).astype(np.float64)),
+        ("double", vertices),
+        ("far", vertices + np.array([4e6, -3e5, 12.5])),
+    ):
+        for suffix in (".ply", ".glb"):
+            file = tmp_path / f"{name}{suffix}"
+            write_mesh(file, points, faces)
+            read, triangles = read_mesh(file)
+            np.testing.assert_array_equal(triangles, faces)
+            off = np.abs(read - points).max()
+            assert off == 0 if suffix == ".ply" else off < 3e-7
+        header = (tmp_path / f"{name}.ply").read_bytes().split(b"end_header")[0]
+        assert (b"property double x" in header) == (name != "single")
+        sizes[name] = len((tmp_path / f"{name}.ply").read_bytes())
+    assert sizes["single"] < sizes["double"] == sizes["far"]
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError, ValueError])
 def test_an_interrupted_write_leaves_what_was_there(tmp_path, monkeypatch, error):
     vertices, faces, _ = labelled_cube()

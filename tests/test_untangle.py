@@ -1,14 +1,19 @@
 """untangle_pose: less overlap than before or the same pose, whatever the solver."""
 
+import functools
+
 import ipctk
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+import trimesh
 from helpers import body_faces, embedded_body, mocap
 
-from spt_jax import self_intersection_penalty, untangle_pose
+from spt_jax import BodyModel, self_intersection_penalty, untangle_pose
+from spt_jax.overlap.measure import Unmeasurable
 from spt_jax.untangle import pose as untangle
+from spt_jax.untangle.results import RESULTS
 
 QUICK = {"folds": "count", "rays": 64, "weights": (0.1, 1.0, 10.0), "steps_per_weight": 20}
 
@@ -48,6 +53,7 @@ def test_a_pose_without_overlap_comes_back_to_the_bit():
     result = untangle_pose(embedded_body(), pose, **QUICK)
     np.testing.assert_array_equal(result.pose, pose)
     assert result.steps == 0 and result.before.volume == result.after.volume == 0
+    assert result.free and result.reason == "free"
 
 
 def test_shape_and_translation_are_used_and_kept(x64):
@@ -70,7 +76,7 @@ def test_the_best_pose_seen_is_kept(monkeypatch):
 
     def undoing(search, body, fixed, moved, margin, weight):
         if weight > 1.0:
-            return -3.0 * moved, search.steps_per_weight
+            return -3.0 * moved, search.steps_per_weight, RESULTS.successful
         return descend(search, body, fixed, moved, margin, weight)
 
     monkeypatch.setattr(untangle, "_descend", undoing)
@@ -79,7 +85,7 @@ def test_the_best_pose_seen_is_kept(monkeypatch):
     both = untangle_pose(embedded_body(), pose, weights=(1.0, 2.0), **options)
     assert first.after.volume < 0.9 * first.before.volume
     np.testing.assert_array_equal(both.pose, first.pose)
-    assert both.steps == 20
+    assert both.steps == 20 and not both.free
 
 
 def test_collisions_go_and_nothing_else_moves():
@@ -90,6 +96,7 @@ def test_collisions_go_and_nothing_else_moves():
     assert result.before.crossings > 20 and result.before.volume > 1e-7
     assert result.after.crossings == 0 and result.after.volume == 0
     assert result.after.total_volume > 0  # the armpits are left as they are
+    assert result.free and result.result == RESULTS.successful
     moved = np.linalg.norm(result.vertices - body(pose).vertices, axis=1)
     assert moved.mean() < 0.002 and moved.max() < 0.02
 
@@ -111,6 +118,7 @@ def test_folds_go_by_the_vertices():
     result = untangle_pose(body, pose, folds="remove")
     np.testing.assert_array_equal(result.pose, pose)
     assert result.before.total_crossings > 50 and result.after.total_crossings == 0
+    assert result.free and result.after.total_volume == 0
     assert has_intersections(body(pose).vertices)
     assert not has_intersections(result.vertices)
     moved = np.linalg.norm(result.vertices - body(pose).vertices, axis=1)
@@ -138,7 +146,111 @@ def test_never_worse_than_the_start():
     )
     np.testing.assert_array_equal(result.pose, pose)
     assert result.after.volume == result.before.volume > 0
-    assert result.steps == 3
+    assert result.steps == 3 and not result.free
+    assert result.result != RESULTS.successful and result.reason != "free"
+
+
+@functools.cache
+def boxes():
+    """A trunk, and an arm that a joint beside it swings into the trunk; a box each."""
+    trunk = trimesh.creation.box((0.4, 0.4, 0.4)).subdivide()
+    arm = trimesh.creation.box((0.3, 0.1, 0.12)).subdivide()
+    arm.apply_translation([0.5, 0.01, 0.02])
+    count = len(trunk.vertices)
+    template = np.concatenate([trunk.vertices, arm.vertices]).astype(np.float32)
+    weights = np.zeros((len(template), 3), np.float32)
+    weights[:count, 0] = weights[count:, 1] = 1.0
+    joints = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.65, 0.0, 0.0]], np.float32)
+    return BodyModel(
+        template=jnp.asarray(template),
+        shape_basis=jnp.zeros((len(template), 3, 1), jnp.float32).at[:, 0, 0].set(1.0),
+        joint_template=jnp.asarray(joints),
+        joint_shape_basis=jnp.zeros((3, 3, 1), jnp.float32),
+        weights=jnp.asarray(weights),
+        faces=jnp.asarray(np.concatenate([trunk.faces, arm.faces + count]), jnp.int32),
+        parents=(-1, 0, 1),
+        joint_names=("trunk", "arm", "tip"),
+    )
+
+
+def swung(angle, dtype="float32"):
+    return jnp.zeros((3, 3), dtype).at[1, 1].set(angle)
+
+
+@pytest.mark.parametrize("rays", ["auto", 64])
+@pytest.mark.parametrize("folds", ["ignore", "count"])
+@pytest.mark.parametrize("rate", [1e30, 1e4])
+def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, rays, rate):
+    seen = []
+    running = optx.GradientDescent(learning_rate=rate, rtol=1e-9, atol=1e-9)
+    result = untangle_pose(
+        boxes(),
+        swung(2.6),
+        folds=folds,
+        rays=rays,
+        solver=running,
+        steps_per_weight=4,
+        on_step=lambda *step: seen.append(step),
+    )
+    assert result.before.volume > 1e-4
+    for part in (result.pose, result.vertices, result.after.volume, result.after.ratio):
+        assert np.isfinite(part).all()
+    np.testing.assert_array_equal(result.pose, swung(2.6))
+    assert result.after.volume == result.before.volume and not result.free
+    assert result.result == RESULTS.nonlinear_divergence and "diverged" in result.reason
+    assert len(seen) >= 5 and any(np.isnan(volume) for _, _, volume in seen)
+
+
+def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
+    """Every second descent ends nowhere, in a full turn and more, or at numbers that are none."""
+    descend, calls = untangle._descend, []
+
+    def sometimes(search, body, fixed, moved, margin, weight):
+        calls.append(np.array(moved))
+        found, steps, ended = descend(search, body, fixed, moved, margin, weight)
+        lost = jnp.full_like(found, jnp.nan) if len(calls) % 4 else 1e6 * jnp.ones_like(found)
+        return (lost if len(calls) % 2 else found), steps, ended
+
+    monkeypatch.setattr(untangle, "_descend", sometimes)
+    result = untangle_pose(boxes(), swung(2.6, dtype), weights=(0.1, 1.0, 10.0, 100.0, 1000.0))
+    assert result.free and result.after.volume == 0 and result.pose.dtype == dtype
+    assert all(np.isfinite(moved).all() for moved in calls) and len(calls) >= 2
+
+
+def test_each_pose_of_a_batch_says_how_it_ended(monkeypatch):
+    descend = untangle._descend
+
+    def fails_for_some(search, body, fixed, *rest):
+        found, steps, ended = descend(search, body, fixed, *rest)
+        return (found * jnp.nan if fixed[0][1, 1] > 2.7 else found), steps, ended
+
+    monkeypatch.setattr(untangle, "_descend", fails_for_some)
+    poses = jnp.stack([swung(angle) for angle in (0.3, 2.6, 2.8)])
+    result = untangle_pose(boxes(), poses)
+    assert result.free.tolist() == [True, True, False]
+    assert (result.result == RESULTS.nonlinear_divergence).tolist() == [False, False, True]
+    assert result.reason[:2] == ["free", "free"] and "diverged" in result.reason[2]
+    assert np.isfinite(result.vertices).all()
+
+
+def test_a_body_that_cannot_be_measured_is_refused():
+    far = np.array([3e38], np.float32)
+    with pytest.raises(Unmeasurable, match="rounding allows"):
+        untangle_pose(boxes(), swung(2.6), translation=np.full(3, 1e5, np.float32))
+    with pytest.raises(Unmeasurable, match="vertices must be finite"):
+        untangle_pose(boxes(), swung(2.6), shape=far, translation=np.full(3, 3e38, np.float32))
+
+
+def test_what_is_a_fold_can_be_set():
+    body, pose = embedded_body(), frame("run/0005")
+    quick = {"weights": (1.0,), "steps_per_weight": 1, "margin": 0.0}
+    usual, none, wide = (
+        untangle_pose(body, pose, fold_distance=distance, **quick) for distance in (None, 0.0, 9.0)
+    )
+    assert usual.before.crossings == 0 == wide.before.crossings
+    assert int(none.before.crossings) > 0.9 * int(none.before.total_crossings)
+    assert none.before.volume > 0.9 * none.before.total_volume
+    assert usual.before.total_volume == none.before.total_volume
 
 
 @pytest.mark.parametrize(
@@ -157,6 +269,7 @@ def test_never_worse_than_the_start():
         (np.zeros((52, 3), "float32"), {"rays": 4000}, "up to 2048"),
         (np.zeros((52, 3), "float32"), {"folds": "keep"}, "folds must be one of 'ignore'"),
         (np.zeros((52, 3), "float32"), {"margin": -0.1}, "margin must be finite and not neg"),
+        (np.zeros((52, 3), "float32"), {"fold_distance": -0.1}, "fold_distance must be finite"),
         (np.zeros((52, 3), "float32"), {"steps_per_weight": 0}, "steps_per_weight must be"),
         (
             np.zeros((52, 3), "float32"),

@@ -1,4 +1,4 @@
-"""untangle_mesh: no edge through a triangle any more, by a judge that is not ours."""
+"""untangle_mesh: no edge through a triangle any more, by a judge that is not ours, never worse."""
 
 import json
 
@@ -15,14 +15,20 @@ from helpers import (
     moved,
     posed_bodies,
     random_rotation,
+    sampling,
+    signed_volume,
     sphere,
 )
 
 from spt_jax.cli import main
-from spt_jax.mesh_files import read_mesh
+from spt_jax.mesh_files import read_mesh, write_mesh
+from spt_jax.overlap.measure import Unmeasurable, measure
+from spt_jax.overlap.triangles import pairs as pairs_module
 from spt_jax.overlap.triangles.pairs import edge_crossings
 from spt_jax.untangle.contours import contour_forces
+from spt_jax.untangle.freeing import _Search
 from spt_jax.untangle.mesh import untangle_mesh
+from spt_jax.untangle.results import RESULTS
 from spt_jax.untangle.spread import Spread, Surface
 
 
@@ -56,7 +62,9 @@ SHAPES = {
     "spheres": two_spheres(1.5),
     "spheres deep in each other": two_spheres(0.5),
     "boxes": join(box(), box(center=(0.5, 0.1, 0.2))),
-    "one box twice": join(box(), box()),
+    "plates": join(box((1.0, 1.0, 0.1)), box((1.0, 1.0, 0.1), (0.1, 0.2, 0.07))),
+    "a screw in a block": join(box((4.0, 4.0, 1.0)), box((0.2, 0.2, 0.6), (0.3, 0.1, 0.4))),
+    "thin beams": join(box((4, 0.01, 0.01)), box((0.01, 4, 0.01)), box((0.01, 0.01, 4))),
     "a box through a box": join(box(), box((0.2, 0.2, 4.0))),
     "three": join(two_spheres(1.0), sphere(center=(0.5, 0.8, 0.0), subdivisions=3)),
     "a tube that enters itself": bent_tube(0.3, 0.3, 0.15, sides=24, steps=150),
@@ -71,6 +79,7 @@ def test_other_shapes_come_free(shape, dtype):
     result = untangle_mesh(vertices.astype(dtype), faces)
     assert result.free == (not intersects(result.vertices, faces))
     assert result.free and result.vertices.dtype == dtype
+    assert result.inverted_parts == 0 and result.relative_displacement <= 1.0
 
 
 def test_two_spheres_go_hardly_further_than_they_must():
@@ -88,14 +97,19 @@ def test_two_spheres_go_hardly_further_than_they_must():
 def test_what_does_not_cross_comes_back_to_the_bit():
     apart = two_spheres(2.5)
     nested = join(sphere(subdivisions=3), sphere(0.5, subdivisions=2))
+    copies = join(*[sphere(subdivisions=1)] * 5)
     seen = []
-    for vertices, faces in (apart, nested):
-        result = untangle_mesh(vertices, faces, on_step=lambda *step: seen.append(step))
-        assert result.vertices.tobytes() == vertices.tobytes()
-        assert result.free and result.moved == result.steps == 0
+    for mesh, volume in ((apart, 0.0), (nested, np.pi / 6), (copies, 2 * signed_volume(*copies))):
+        result = untangle_mesh(*mesh, on_step=lambda *step: seen.append(step))
+        assert result.vertices.tobytes() == mesh[0].tobytes()
+        assert result.moved == result.steps == 0 and result.inverted_parts == 0
         assert result.largest_displacement == result.median_displacement == 0.0
-    # A part within another has overlap, but nothing crosses; the result does not hide it.
-    assert result.after.volume == pytest.approx(np.pi / 6, rel=0.1) and seen == []
+        # A part within another, or on its copy, has overlap, but nothing that crosses; the result
+        # does not hide it.
+        assert result.after.volume == pytest.approx(volume, rel=0.1) and seen == []
+        assert result.free == (volume == 0)
+        assert result.result == (RESULTS.enclosed if volume else RESULTS.successful)
+        assert ("wholly within another" in result.reason) == (volume > 0)
 
 
 def test_a_part_that_crosses_nothing_stays_where_it_is():
@@ -124,15 +138,199 @@ def test_turned_and_shifted_it_goes_as_far(rng):
 
 
 def test_never_worse_and_bounded_when_it_cannot():
-    vertices, faces = two_spheres(0.5)
+    vertices, faces = SHAPES["a tube that enters itself"]
     seen = []
     result = untangle_mesh(
         vertices, faces, attempts=2, steps_per_attempt=1, on_step=lambda *s: seen.append(s)
     )
     assert not result.free and result.steps == 2
-    assert result.after.crossings <= result.before.crossings
-    assert [step[:2] for step in seen] == [(0, 0), (1, 1)]
+    assert result.result == RESULTS.nonlinear_max_steps_reached
+    assert_no_worse(vertices, faces, result)
+    # One part alone is not pushed away from others as it is.
+    assert [step[:2] for step in seen] == [(0, 0), (1, 1), (2, 2)]
     assert seen[0][2] == result.before.crossings
+
+
+def assert_no_worse(vertices, faces, result):
+    """The figures, measured anew, and nothing worse than it was."""
+    rounding = float(np.finfo(vertices.dtype).eps)
+    before, after = (
+        measure(np.float64(points), faces, sampling("auto"), rounding=rounding)
+        for points in (vertices, result.vertices)
+    )
+    for found, told in ((before, result.before), (after, result.after)):
+        assert told.crossings == found.total_crossing_pairs
+        assert told.volume == pytest.approx(found.volume, rel=1e-9, abs=1e-15)
+    assert result.vertices.dtype == vertices.dtype
+    assert after.total_crossing_pairs <= before.total_crossing_pairs
+    assert after.volume <= before.volume * (1 + 1e-9)
+    assert result.free == (after.total_crossing_pairs == 0 and after.volume == 0)
+    surface = Surface(faces, len(vertices))
+    senses = [surface.part_senses(np.float64(x)) for x in (vertices, result.vertices)]
+    assert result.inverted_parts == np.count_nonzero(senses[0] * senses[1] < 0) == 0
+    normals = []
+    for points in (vertices, result.vertices):
+        a, b, c = np.float64(points)[faces].transpose(1, 0, 2)
+        normals.append(np.cross(b - a, c - a))
+    flipped = np.einsum("fi,fi->f", *normals) < 0
+    assert result.flipped_triangles == np.count_nonzero(flipped)
+    shift = np.linalg.norm(np.float64(result.vertices) - vertices, axis=1)
+    assert result.moved == np.count_nonzero(shift)
+    size = surface.part_sizes(np.float64(vertices))[surface.part]
+    assert result.relative_displacement == pytest.approx((shift / size).max(), rel=1e-6)
+    assert result.relative_displacement <= 1 + 1e-6
+    touched = np.unique(surface.part[np.unique(faces[before.surface.pairs[before.surface.listed]])])
+    assert not shift[~np.isin(surface.part, touched)].any()  # what intersects nothing stays
+    if not before.total_crossing_pairs:
+        assert result.vertices.tobytes() == vertices.tobytes()
+
+
+def scene(rng):
+    """Boxes, plates, beams and spheres thrown together, some of them flush with each other."""
+    parts = []
+    for _ in range(rng.integers(2, 6)):
+        kind = rng.integers(4)
+        center = 0.5 * np.round(rng.uniform(-1, 1, 3) * 2) if kind < 2 else rng.uniform(-1, 1, 3)
+        extents = [(1, 1, 1), (1, 1, 0.05), (2, 0.03, 0.02), (0.5, 0.4, 0.6)][kind]
+        if kind == 3:
+            parts.append(sphere(rng.uniform(0.3, 0.8), center, subdivisions=2))
+        else:
+            parts.append(box(extents, center))
+    return join(*parts)
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_never_worse_whatever_is_given(number):
+    rng = np.random.default_rng(number)
+    rotation = random_rotation(rng) if number % 3 else None
+    vertices, faces = moved(scene(rng), rotation, rng.uniform(-1, 1, 3))
+    vertices = vertices.astype(np.float32 if number % 2 else np.float64)
+    for options in ({"attempts": 1, "steps_per_attempt": 2}, {"steps_per_attempt": 12}):
+        assert_no_worse(vertices, faces, untangle_mesh(vertices, faces, **options))
+
+
+TOUCHING = {
+    "a face": join(box(), box(center=(1.0, 0.0, 0.0))),
+    "an edge": join(box(), box(center=(1.0, 1.0, 0.0))),
+    "a corner": join(box(), box(center=(1.0, 1.0, 1.0))),
+    "a lid": join(box(), box((0.5, 0.5, 0.5), (0.1, 0.05, 0.75))),
+    "thin plates": join(box((8.0, 8.0, 0.1)), box((8.0, 8.0, 0.1), (0.0, 0.0, 0.1))),
+    "plates that do not match": join(box((8.0, 8.0, 0.1)), box((3.0, 3.0, 0.1), (0.3, 0.2, 0.1))),
+    "a stack": join(*(box((2.0, 2.0, 0.2), (0.1 * k, 0.0, 0.2 * k)) for k in range(4))),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("contact", TOUCHING)
+def test_contact_is_left_as_it_is(contact, dtype, rng):
+    for rotation in (None, *(random_rotation(rng) for _ in range(3))):
+        vertices, faces = moved(TOUCHING[contact], rotation, rng.uniform(-1, 1, 3))
+        vertices = vertices.astype(dtype)
+        result = untangle_mesh(vertices, faces)
+        assert result.vertices.tobytes() == vertices.tobytes()
+        assert result.free and result.before.crossings == 0 == result.before.volume
+
+
+def test_flat_faces_of_many_triangles_are_left_as_they_are(rng):
+    import trimesh
+
+    for level in (1, 2):
+        mesh = trimesh.creation.box()
+        for _ in range(level):
+            mesh = mesh.subdivide()
+        faces = np.array(mesh.faces, np.int64)
+        for _ in range(8):
+            vertices = mesh.vertices @ random_rotation(rng).T
+            for dtype in (np.float32, np.float64):
+                given = vertices.astype(dtype)
+                result = untangle_mesh(given, faces)
+                assert result.free and result.vertices.tobytes() == given.tobytes()
+
+
+def test_contact_stays_where_something_else_is_freed():
+    """Two boxes that overlap, and far from them one on another, in single precision and turned."""
+    rotation = random_rotation(np.random.default_rng(4))
+    apart = join(box(center=(5.0, 0.0, 0.0)), box((0.4, 0.4, 0.4), (5.1, 0.1, 0.7)))
+    vertices, faces = moved(join(box(), box(center=(0.6, 0.2, 0.1)), apart), rotation)
+    vertices = vertices.astype(np.float32)
+    result = untangle_mesh(vertices, faces)
+    assert result.free and result.moved
+    np.testing.assert_array_equal(result.vertices[16:], vertices[16:])
+
+
+def test_thin_plates_keep_their_sides():
+    """Plates in each other by most of their thickness: neither comes out turned over."""
+    thin = (1.0, 1.0, 0.02)
+    vertices, faces = join(box(thin), box(thin, (0.2, 0.1, 0.004)))
+    result = untangle_mesh(vertices, faces)
+    assert result.free and result.flipped_triangles == 0
+    for plate in (faces[:12], faces[12:]):
+        assert signed_volume(result.vertices, plate) == pytest.approx(0.02, rel=0.1)
+    assert result.largest_displacement < 0.1
+
+
+def test_parts_turned_over_or_pushed_inside_are_seen(rng):
+    vertices, faces = two_spheres(1.5, 1)
+    search = _Search(Surface(faces, len(vertices)), vertices, sampling("auto"), lambda *_: None)
+    second = np.arange(len(vertices)) >= len(vertices) // 2
+    shift = np.where(second[:, None], [[3.0, 0.0, 0.0]], 0.0)
+    apart = search.look(vertices + shift)
+    assert apart.left == apart.inverted == 0 and search.is_no_worse(apart)
+    mirrored = vertices * np.where(second[:, None], [[-1.0, 1.0, 1.0]], 1.0) + 2 * shift
+    turned_over = search.look(mirrored)
+    assert turned_over.inverted == 1 and not search.is_no_worse(turned_over)
+    small = np.where(second[:, None], 0.1 * (vertices - [1.5, 0.0, 0.0]), vertices)
+    inside = search.look(small)
+    assert inside.left == 0 and not search.is_no_worse(inside)
+    flat = np.where(second[:, None], vertices * [1.0, 1.0, 12.0] + shift, vertices)
+    assert search.is_crumpled(search.look(flat)) and not search.is_crumpled(apart)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_cannot_be_measured_is_refused(dtype, monkeypatch):
+    vertices, faces = two_spheres(1.5, 2)
+    far = (vertices + 1e6 * (1 if dtype == np.float32 else 1e9)).astype(dtype)
+    with pytest.raises(Unmeasurable, match="farther from the origin"):
+        untangle_mesh(far, faces)
+    scales = (1e300, 1e-310) if dtype == np.float64 else (1e38,)
+    for scale in scales:
+        given = (vertices * scale).astype(dtype)
+        if dtype == np.float64:
+            with pytest.raises(Unmeasurable, match="a size whose cube is a number"):
+                untangle_mesh(given, faces)
+        else:
+            assert_no_worse(given, faces, untangle_mesh(given, faces))
+    for wrong in (
+        vertices * np.nan,
+        np.where(np.arange(len(vertices))[:, None] == 3, np.inf, vertices),
+    ):
+        with pytest.raises(ValueError, match="NaN or infinity"):
+            untangle_mesh(wrong.astype(dtype), faces)
+    monkeypatch.setattr(pairs_module, "_MOST_PAIRS", 0)
+    monkeypatch.setattr(pairs_module, "_MOST_PAIRS_EACH", 0)
+    with pytest.raises(Unmeasurable, match="coordinates that exploded or collapsed"):
+        untangle_mesh(vertices.astype(dtype), faces)
+
+
+def test_a_step_into_nothing_ends_the_attempt(monkeypatch):
+    """A search that runs away comes back with the start, and says so."""
+    vertices, faces = SHAPES["a tube that enters itself"]
+    monkeypatch.setattr(
+        _Search, "move", lambda self, place, *_: np.full(place.vertices.shape, np.nan)
+    )
+    result = untangle_mesh(vertices, faces)
+    assert result.vertices.tobytes() == vertices.tobytes() and not result.free
+    assert result.result == RESULTS.nonlinear_divergence and "diverged" in result.reason
+
+
+def test_double_precision_far_from_the_origin():
+    vertices, faces = two_spheres(1.5)
+    offset = np.array([4e6, -3e5, 1234.5])
+    far = vertices + offset
+    near, result = untangle_mesh(vertices, faces), untangle_mesh(far, faces)
+    assert result.free and result.vertices.dtype == np.float64
+    assert result.largest_displacement == pytest.approx(near.largest_displacement, rel=1e-3)
+    assert not intersects(result.vertices - offset, faces)
 
 
 def test_contour_forces_shorten_the_contour(rng):
@@ -218,11 +416,19 @@ def test_a_mesh_file_that_does_not_come_free_says_so(tmp_path, capsys, monkeypat
 
     monkeypatch.setattr(module, "untangle_mesh", hasty)
     file = tmp_path / "pair.ply"
-    trimesh.Trimesh(*two_spheres(0.5, 2), process=False).export(file)
+    trimesh.Trimesh(*SHAPES["a tube that enters itself"], process=False).export(file)
     assert main(["untangle", str(file), "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
-    assert "not free: " in captured.err and "crossings are left" in captured.err
-    assert "largest displacement" in captured.out
+    assert "not free: " in captured.err and "pairs of triangles are left" in captured.err
+    assert "largest displacement" in captured.out and "triangles turned over" in captured.out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert not report["free"] and "number of steps" in report["reason"]
+    nested = join(sphere(subdivisions=2), sphere(0.5, subdivisions=1))
+    trimesh.Trimesh(*nested, process=False).export(file)
+    assert main(["untangle", str(file), "--out", str(tmp_path / "out")]) == 1
+    assert "within another whole" in capsys.readouterr().err
+    written, _ = read_mesh(tmp_path / "out" / "pair_untangled.ply")
+    np.testing.assert_array_equal(written, nested[0].astype(np.float32))  # as trimesh wrote them
 
 
 def test_a_mesh_file_that_cannot_be_untangled(tmp_path, capsys):
@@ -234,3 +440,43 @@ def test_a_mesh_file_that_cannot_be_untangled(tmp_path, capsys):
     assert "boundary edges" in capsys.readouterr().err and not out.exists()
     assert main(["untangle", str(file), "--out", str(out), "--frames", "1"]) == 2
     assert "frames is for pose files" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl", ".glb"])
+def test_a_mesh_file_far_from_the_origin_is_not_rounded(suffix, tmp_path, capsys):
+    """Where single precision would show, and the format knows no other, the result is a .ply."""
+    import trimesh
+
+    offset = np.array([4e6, -3e5, 1234.5])
+    vertices, faces = two_spheres(1.7, 2)
+    file, out = tmp_path / f"pair{suffix}", tmp_path / "out"
+    if suffix == ".ply":
+        write_mesh(file, vertices + offset, faces)
+    elif suffix == ".stl":
+        file.write_text(trimesh.exchange.stl.export_stl_ascii(trimesh.Trimesh(vertices, faces)))
+        text = file.read_text().splitlines()
+        for k, line in enumerate(text):
+            if "vertex" in line:
+                x, y, z = (np.array(line.split()[1:], float) + offset).tolist()
+                text[k] = f"vertex {x!r} {y!r} {z!r}"
+        file.write_text("\n".join(text))
+    elif suffix == ".glb":
+        write_mesh(file, vertices + offset, faces)  # about its middle, which a node moves
+    else:
+        start = ["OFF", f"{len(vertices)} {len(faces)} 0"] if suffix == ".off" else []
+        vertex, face, first = ("", "3 ", 0) if suffix == ".off" else ("v ", "f ", 1)
+        lines = [*start, *(vertex + " ".join(map(repr, v)) for v in (vertices + offset).tolist())]
+        lines += [face + " ".join(map(str, f)) for f in (faces + first).tolist()]
+        file.write_text("\n".join(lines))
+    before, corners = read_mesh(file)
+    assert np.abs(before[corners].mean(axis=(0, 1)) - offset - [0.85, 0, 0]).max() < 1e-3
+    assert main(["untangle", str(file), "--out", str(out)]) == 0
+    report = json.loads((out / "report.json").read_text())
+    written = ".ply" if suffix in (".stl", ".glb") else suffix
+    assert report["mesh"] == f"pair_untangled{written}" and report["free"]
+    assert ("single precision" in capsys.readouterr().err) == (suffix != written)
+    after, triangles = read_mesh(out / report["mesh"])
+    assert np.array_equal(triangles, corners) and not intersects(after - offset, triangles)
+    still = (after == before).all(axis=1)
+    assert 0 < np.count_nonzero(~still) == report["moved"] < len(before)
+    assert np.abs(after - before).max() < 0.3

@@ -12,7 +12,7 @@ from helpers_body import PARENTS, slow_rotation
 from spt_jax import cli, intersection_report, load_body, untangle_mesh, untangle_pose
 from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
 from spt_jax.body.poses import SMPL_LAYOUTS
-from spt_jax.mesh_files import OUT_COLOUR, read_mesh
+from spt_jax.mesh_files import OUT_COLOUR, read_mesh, write_mesh
 from spt_jax.view import files
 from spt_jax.view.freeing import untangle_scene
 from spt_jax.view.panel import figures
@@ -200,6 +200,34 @@ def test_figures_say_what_was_measured(balls, pair_file):
     assert "unit³" in figures(mesh.read(), mesh, "")
 
 
+def test_what_cannot_be_measured_is_said_and_is_not_free(balls, pair_file):
+    balls.set_pose(np.full((24, 3), np.nan))
+    reading = balls.read()
+    assert reading.error.startswith("vertices must be finite") and not reading.free
+    assert np.isnan(reading.volume) and not reading.labels.any() and reading.crossing_pairs == 0
+    text = figures(reading, balls, reading.error)
+    assert "not measured" in text and "vertices must be finite" in text and ">nan" not in text
+    with pytest.raises(ValueError, match="pose must be finite"):
+        untangle_scene(balls, lambda vertices, text: None, lambda: False)
+    mesh = files.open_file(pair_file)
+    mesh.set_free_vertices(mesh.vertices * np.nan)
+    with pytest.raises(ValueError, match="vertices must be finite"):
+        untangle_scene(mesh, lambda vertices, text: None, lambda: False)
+
+
+def test_a_mesh_far_from_the_origin_is_not_rounded(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    pair = trimesh.util.concatenate(ball, ball.copy().apply_translation([1.8, 0.0, 0.0]))
+    offset = np.array([4e6, -3e5, 123.0])
+    write_mesh(tmp_path / "far.ply", pair.vertices + offset, pair.faces)
+    scene = files.open_file(tmp_path / "far.ply")
+    near = intersection_report(pair.vertices, pair.faces)
+    assert scene.read().volume == pytest.approx(near.volume, rel=1e-6)
+    untangle_scene(scene, lambda vertices, text: None, lambda: False)
+    assert scene.read().free and scene.vertices.dtype == np.float64
+    assert np.abs(scene.vertices - offset - pair.vertices).max() < 0.2
+
+
 def test_files_are_told_apart(balls, ball_file, pair_file, tmp_path):
     assert balls.body.num_joints == 24 and balls.name == "balls"
     assert files.open_file(pair_file).body is None
@@ -342,6 +370,15 @@ def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(
         view._do("untangle", "untangle")
         assert view.worker.wait_until_idle(30)
         assert view.scene.body is None and view._status == "free"
+        kept = view.scene.vertices
+        view.scene.set_free_vertices(np.full_like(kept, np.inf))
+        view._do("through", "see_through", False)
+        assert view.worker.wait_until_idle(30)
+        assert "vertices must be finite" in view.panel._figures.content
+        view._do("untangle", "untangle")
+        assert view.worker.wait_until_idle(30)
+        assert "vertices must be finite" in view._status
+        view.scene.set_free_vertices(kept)
         write_poses(tmp_path / "two.npz", np.zeros((2, 22, 3)), names=["one", "two"])
         view._do("open", "open_upload", "two.npz", (tmp_path / "two.npz").read_bytes())
         view._do("frame", "choose_frame", 1)

@@ -63,6 +63,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
             Motion,
             as_report,
             before_after_table,
+            left_out,
             summary,
             untangle_frames,
             write_meshes,
@@ -92,6 +93,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
     console = out_console(quiet)
     console.print(before_after_table(done))
     show(console, summary(done))
+    show(console, left_out((f.before for f in done), (f.after for f in done)))
     pictures = "" if missing else "before_after.png, "
     show(
         console,

@@ -1,6 +1,7 @@
 """What `spt-jax fit` tells, writes and draws of people once they are fitted."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from spt_jax.body import BodyModel
     from spt_jax.fit.result import FitResult
+    from spt_jax.rest_surface import RestSurface
 
 _LARGEST_CANVAS = 2000  # pixels of a side, where there is no photograph
 _CUBIC_CENTIMETRES = 1e6
@@ -65,14 +67,18 @@ def _scaled(camera: Any, scale: float) -> Any:
     return PinholeCamera(*(np.asarray(part, np.float32) for part in parts), near=camera.near)
 
 
-def as_fitted(body: "BodyModel", one: Annotated, result: "FitResult", seconds: float) -> Fitted:
-    """One person's fit in NumPy, measured."""
+def as_fitted(
+    body: "BodyModel", one: Annotated, result: "FitResult", folds: "RestSurface", seconds: float
+) -> Fitted:
+    """One person's fit in NumPy, measured; no overlap where there is no body to measure."""
+    from spt_jax.overlap.measure import Unmeasurable
     from spt_jax.report import intersection_report
 
     vertices = np.asarray(result.vertices)
     overlap = None
     if np.isfinite(vertices).all():
-        overlap = intersection_report(vertices, body.faces, folds=body.rest_surface)
+        with suppress(Unmeasurable):
+            overlap = intersection_report(vertices, body.faces, folds=folds)
     root = np.asarray(one.camera.to_camera(result.joints[:1]))[0]
     return Fitted(
         given=one,

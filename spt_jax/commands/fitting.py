@@ -1,5 +1,6 @@
 """How `spt-jax fit` fits the people that it has gathered: one by one, or a scene together."""
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -53,6 +54,7 @@ def fit_everyone(
     groups: Sequence[Sequence[Annotated]],
     *,
     regulariser: Named,
+    fold_distance: float | None = None,
     robust: Robust,
     fit_shape: bool,
     state: State,
@@ -65,11 +67,16 @@ def fit_everyone(
     Returns:
         The people, group by group; and of each scene what report.json says.
     """
+    from spt_jax.exclusions import as_fold_surface
     from spt_jax.fit import people as scenes
     from spt_jax.fit import pose as fitting
-    from spt_jax.fit.terms.regularisers import as_regulariser
+    from spt_jax.fit.terms.regularisers import SelfIntersection, as_regulariser
 
-    prepared = as_regulariser(regulariser).prepared(body, 1)
+    term = as_regulariser(regulariser)
+    if isinstance(term, SelfIntersection):
+        term = dataclasses.replace(term, fold_distance=fold_distance)
+    prepared = term.prepared(body, 1)
+    folds = as_fold_surface(body, fold_distance)
     found, told, compiled = [], [], set()
     for group in groups:
         key = (group[0].person.layout, len(group))
@@ -87,6 +94,7 @@ def fit_everyone(
         }
         points = np.stack([one.person.points for one in group]).astype(np.float32)
         if len(group) > 1:
+            options["fold_distance"] = fold_distance
             scene = scenes.fit_people(body, points, group[0].camera, **options)
             results = scene.people
             told.append(
@@ -107,7 +115,7 @@ def fit_everyone(
         state(f"{name}: measuring")
         for k, one in enumerate(group):
             result = jax.tree.map(lambda leaf, k=k: leaf[k], results)
-            found.append(as_fitted(body, one, result, seconds))
+            found.append(as_fitted(body, one, result, folds, seconds))
     return found, told
 
 

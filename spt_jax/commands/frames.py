@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from spt_jax.commands.terminal import State
+from spt_jax.commands.terminal import State, measurable
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,6 +45,8 @@ class Frame:
     after: "IntersectionReport"
     steps: int
     seconds: float
+    free: bool
+    reason: str
 
     @property
     def file_name(self) -> str:
@@ -59,13 +61,15 @@ def untangle_frames(
     rays: "int | Literal['auto']",
     directions: int,
     folds: "Folds",
+    fold_distance: float | None = None,
     state: State,
 ) -> list[Frame]:
-    """Report on each frame, untangle it, and report again; folds that stay are not reported."""
+    """Report on each frame, untangle it, and report again; folds that stay are left out."""
+    from spt_jax.exclusions import as_fold_surface
     from spt_jax.report import intersection_report
     from spt_jax.untangle.pose import untangle_pose
 
-    rest = body.rest_surface if folds == "ignore" else None
+    rest = as_fold_surface(body, fold_distance) if folds == "ignore" else None
     asked = {"rays": rays, "directions": directions, "folds": rest}
     frames = []
     for k, name in enumerate(motion.names):
@@ -79,19 +83,22 @@ def untangle_frames(
             state(f"{name}: stage {int(stage)}, step {int(steps)}, {volume:.1f} cm³")
 
         vertices = np.asarray(body(motion.pose[k], shape, translation).vertices)
-        before = intersection_report(vertices, body.faces, **asked)
-        result = untangle_pose(
-            body,
-            motion.pose[k],
-            shape=shape,
-            translation=translation,
-            folds=folds,
-            # It measures with twice as many as it searches with.
-            rays=rays if rays == "auto" else max(rays // 2, 1),
-            directions=directions,
-            on_step=on_step,
-        )
-        untangled = np.asarray(result.vertices)
+        with measurable(name):
+            before = intersection_report(vertices, body.faces, **asked)
+            result = untangle_pose(
+                body,
+                motion.pose[k],
+                shape=shape,
+                translation=translation,
+                folds=folds,
+                fold_distance=fold_distance,
+                # It measures with twice as many as it searches with.
+                rays=rays if rays == "auto" else max(rays // 2, 1),
+                directions=directions,
+                on_step=on_step,
+            )
+            untangled = np.asarray(result.vertices)
+            after = intersection_report(untangled, body.faces, **asked)
         frames.append(
             Frame(
                 name=name,
@@ -99,9 +106,11 @@ def untangle_frames(
                 vertices_before=vertices,
                 vertices_after=untangled,
                 before=before,
-                after=intersection_report(untangled, body.faces, **asked),
+                after=after,
                 steps=int(result.steps),
                 seconds=time.perf_counter() - start,
+                free=bool(result.free),
+                reason=result.reason,
             )
         )
     return frames
@@ -120,7 +129,7 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
         "\nafter",
         "overlap, cm³\nbefore",
         "\nafter",
-        "crossings\nbefore",
+        "pairs\nbefore",
         "\nafter",
         "steps",
         "time",
@@ -152,8 +161,29 @@ def summary(frames: Sequence[Frame]) -> str:
     change = f" ({after / before - 1:+.2%})" if before else ""
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
     pairs = sum(frame.after.crossing_pairs[0] for frame in frames)
-    left = f"; {pairs} pairs of triangles still cross" if pairs else "; no triangles cross"
-    return f"{count}: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after{change}{left}"
+    free = sum(frame.free for frame in frames)
+    left = f"; {pairs} pairs of triangles still intersect" if pairs else "; no triangles intersect"
+    return (
+        f"{count}, {free} free: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after{change}"
+        f"{left}"
+    )
+
+
+def left_out(before: Iterable["IntersectionReport"], after: Iterable["IntersectionReport"]) -> str:
+    """What is left out of all reports as folds, in one line.
+
+    Args:
+        before, after: the reports; where there was nothing to compare with, the first are none.
+    """
+    parts = []
+    for when, reports in (("before", list(before)), ("after", list(after))):
+        if reports:
+            volume = sum(report.total_volume - report.volume for report in reports)
+            pairs = sum(report.crossing_pairs[1] - report.crossing_pairs[0] for report in reports)
+            parts.append((f"{volume * _CUBIC_CENTIMETRES:.2f} cm³ and {pairs} pairs", when))
+    if len(parts) == 1:
+        return f"left out as folds: {parts[0][0]} of triangles"
+    return "left out as folds: " + ", ".join(f"{what} {when}" for what, when in parts)
 
 
 def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -> dict[str, Any]:
@@ -168,6 +198,8 @@ def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -
                 "name": frame.name,
                 "before": frame.before.as_dict(),
                 "after": frame.after.as_dict(),
+                "free": frame.free,
+                "reason": frame.reason,
                 "steps": frame.steps,
                 "seconds": round(frame.seconds, 3),
             }

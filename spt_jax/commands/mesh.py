@@ -8,22 +8,31 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.commands.terminal import err_console, out_console, progress_bar, show, user_errors
+from spt_jax.commands.terminal import (
+    err_console,
+    measurable,
+    out_console,
+    progress_bar,
+    show,
+    user_errors,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from spt_jax.untangle.mesh import UntangleMeshResult
 
-# Text formats keep every digit; the others hold float32, so the mesh must be free in float32.
+# Text formats keep every digit, and .ply holds either precision; .glb and .stl hold float32, so the
+# mesh must be free in float32.
 _TEXT = (".obj", ".off")
-_BINARY = (".ply", ".glb", ".stl")
+_SINGLE = (".glb", ".stl")
+_KNOWN = (*_TEXT, *_SINGLE, ".ply")
 
 
 def untangle_mesh_file(
     path: Path, out: Path, *, meshes: bool, rays: int | Literal["auto"], json: bool, quiet: bool
 ) -> int:
-    """Free one mesh; the exit code is 0 if no overlap is left, and 1 otherwise."""
+    """Free one mesh; the exit code is 0 if it is free, and 1 otherwise."""
     from spt_jax.arguments import as_rays
     from spt_jax.mesh_check import check_mesh
     from spt_jax.mesh_files import read_mesh
@@ -33,24 +42,21 @@ def untangle_mesh_file(
         as_rays(rays)
         vertices, faces = read_mesh(path)
         check_mesh(vertices, faces).raise_if_unfit()
-        suffix, notes = path.suffix.lower(), []
-        if suffix not in _TEXT + _BINARY:
-            notes.append(f"{suffix} files are read only; the mesh is written as .ply")
-            suffix = ".ply"
+        given, suffix, notes = _as_stored(vertices, path.suffix.lower())
         folder = ensure_folder(out)
     for note in notes:
         show(err_console(quiet), f"note: {note}", "yellow")
-    given = vertices if suffix in _TEXT else vertices.astype(np.float32)
     start = time.perf_counter()
     with progress_bar(1, quiet) as state:
         from spt_jax.untangle.mesh import untangle_mesh
 
-        def on_step(attempt: int, steps: int, crossings: int) -> None:
-            state(f"{path.name}: attempt {attempt + 1}, step {steps}, {crossings} crossings")
+        def on_step(attempt: int, steps: int, pairs: int) -> None:
+            state(f"{path.name}: attempt {attempt + 1}, step {steps}, {pairs} pairs to part")
 
-        # Half the rays, as for poses: the last crossings do not hang on them.
+        # Half the rays, as for poses: the last intersections do not hang on them.
         sampling = {} if rays == "auto" else {"rays": max(rays // 2, 1)}
-        result = untangle_mesh(given, faces, on_step=on_step, **sampling)
+        with measurable(path.name):
+            result = untangle_mesh(given, faces, on_step=on_step, **sampling)
         seconds = time.perf_counter() - start
         state("writing", done=1)
         report: dict[str, Any] = {
@@ -76,22 +82,45 @@ def untangle_mesh_file(
         console.print(_table(result, seconds))
         also = "".join(f", {name}" for name in report["meshes"])
         show(console, f"in {folder}: {report['mesh']}, report.json{also}")
-    if not result.free:
-        left = result.after.crossings
+    if result.after.crossings:
         show(
             err_console(quiet),
-            f"not free: {left} of {result.before.crossings} crossings are left; part the pieces "
-            "by hand where they are deepest, or refine the mesh there",
+            f"not free: {result.after.crossings} of {result.before.crossings} intersecting pairs "
+            "of triangles are left; part the pieces by hand where they are deepest, or refine the "
+            "mesh there",
             "red",
         )
-    elif result.after.volume > 0:
+    elif not result.free:
         show(
             err_console(quiet),
-            f"nothing crosses, but {result.after.volume:.4g} units³ of overlap are left: a part "
-            "that lies within another whole is not pushed out; move it by hand",
+            f"not free: nothing intersects, but {result.after.volume:.4g} units³ of overlap are "
+            "left; a part that lies within another whole, or on a copy of its own, is not pushed "
+            "out: move it by hand, or take it out",
             "red",
         )
-    return 0 if result.free and not result.after.volume > 0 else 1
+    return 0 if result.free else 1
+
+
+def _as_stored(
+    vertices: Float[np.ndarray, "V 3"], suffix: str
+) -> tuple[Float[np.ndarray, "V 3"], str, list[str]]:
+    """The vertices as the written file will hold them, its suffix, and what there is to say."""
+    if suffix in _TEXT:
+        return vertices, suffix, []
+    from spt_jax.mesh_files import fits_single, single_rounding
+
+    rounding, notes = single_rounding(vertices), []
+    if suffix not in _KNOWN:
+        notes.append(f"{suffix} files are read only; the mesh is written as .ply")
+        suffix = ".ply"
+    if suffix in _SINGLE and not fits_single(vertices):
+        notes.append(
+            f"{suffix} files hold single precision, which would move vertices by up to "
+            f"{rounding:.2g} this far from the origin; the mesh is written as .ply"
+        )
+        suffix = ".ply"
+    double = suffix == ".ply" and rounding > 0
+    return vertices if double else vertices.astype(np.float32), suffix, notes
 
 
 def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
@@ -102,12 +131,15 @@ def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     before, after = result.before, result.after
     colour = "green" if result.free else "red"
-    table.add_row("crossings", f"{before.crossings}", f"[{colour}]{after.crossings}[/{colour}]")
+    left = f"[{colour}]{after.crossings}[/{colour}]"
+    table.add_row("intersecting pairs", f"{before.crossings}", left)
     table.add_row("overlap, units³", f"{before.volume:.4g}", f"{after.volume:.4g}")
     table.add_row("vertices in overlap", f"{before.ratio:.2%}", f"{after.ratio:.2%}")
     table.add_row("vertices moved", "", f"{result.moved}")
     table.add_row("median displacement", "", f"{result.median_displacement:.4g}")
     table.add_row("largest displacement", "", f"{result.largest_displacement:.4g}")
+    table.add_row("  of its part's size", "", f"{result.relative_displacement:.2%}")
+    table.add_row("triangles turned over", "", f"{result.flipped_triangles}")
     table.add_row("steps, time", "", f"{result.steps}, {seconds:.1f} s")
     return table
 

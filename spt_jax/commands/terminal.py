@@ -28,6 +28,17 @@ def user_errors() -> Iterator[None]:
         raise CommandError(" ".join(str(error).split())) from error
 
 
+@contextmanager
+def measurable(what: str) -> Iterator[None]:
+    """Turn the error about a surface that cannot be measured into `CommandError`, with its name."""
+    from spt_jax.overlap.measure import Unmeasurable
+
+    try:
+        yield
+    except Unmeasurable as error:
+        raise CommandError(f"{what}: {' '.join(str(error).split())}") from error
+
+
 def show(console: Console, text: str, style: str | None = None) -> None:
     """Print one line as it is: paths and messages may hold brackets, and may be long."""
     console.print(text, style=style, markup=False, soft_wrap=True)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from spt_jax.arguments import as_margin
 from spt_jax.body import BodyModel
 from spt_jax.camera import PinholeCamera
+from spt_jax.exclusions import as_fold_surface
 from spt_jax.fit.inputs import Person
 from spt_jax.fit.pose import fit_pose
 from spt_jax.fit.programs import program
@@ -22,7 +23,9 @@ from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import descend
 from spt_jax.fit.terms.regularisers import SelfIntersection, as_weights
 from spt_jax.groups import between_groups, join_bodies, within_groups
+from spt_jax.overlap.measure import Unmeasurable
 from spt_jax.report import intersection_report
+from spt_jax.rest_surface import RestSurface
 
 # What is tried where people still cross: the margin, times this, with the last weight again.
 _WIDER = (2.0, 4.0, 8.0)
@@ -32,8 +35,8 @@ class Penetration(eqx.Module):
     """How far people are in each other and in themselves, the folds of skin aside.
 
     Attributes:
-        between, within: overlap volumes, in m^3.
-        crossings_between, crossings_within: pairs of triangles that pass through each other.
+        between, within: overlap volumes, in m^3; NaN where a body is none that could be measured.
+        crossings_between, crossings_within: pairs of triangles that intersect; -1 in that case.
     """
 
     between: Float[Array, ""]
@@ -66,6 +69,7 @@ def fit_people(
     joints: Any,
     weights: Any = (0.01, 0.1, 1.0, 10.0, 100.0),
     margin: float = 0.002,
+    fold_distance: float | None = None,
     max_steps: int = 25,
     **options: Any,
 ) -> PeopleResult:
@@ -83,6 +87,8 @@ def fit_people(
         joints: what the keypoints are, as in `fit_pose`.
         weights: of the overlap in cm^3, one for each stage of the scene.
         margin: how far apart surfaces are pushed, in metres.
+        fold_distance: how near to each other, along the rest surface and in metres, sheets of one
+            body are folds; None: the body's own distances, place by place.
         max_steps: of each stage.
         options: of `fit_pose`, by name: confidence, shape, prior and so on; `regulariser` is what
             each person is fitted with alone.
@@ -127,11 +133,12 @@ def fit_people(
     count = len(alone.pose)
     gap = as_margin(margin)
     defaults = {name: p.default for name, p in known.items() if p.default is not p.empty}
-    scene = SelfIntersection(weights, margin=jnp.asarray(gap))
+    rest = as_fold_surface(body, fold_distance)
+    scene = SelfIntersection(weights, margin=jnp.asarray(gap), fold_distance=fold_distance)
     setup, people, _ = prepare_fit(
         body, keypoints, camera, **{**defaults, **options, "regulariser": scene}, in_scene=count
     )
-    best, before = alone, _penetration(body, alone)
+    best, before = alone, _penetration(body, alone, rest)
     after, steps = before, jnp.array(0)
     rising = list(as_weights(weights)[:, None])
     attempts = [(gap, rising)] + [(gap * more, rising[-1:]) for more in _WIDER if gap]
@@ -145,7 +152,7 @@ def fit_people(
                 dataclasses.replace(setup, regulariser=changed), people, fits
             )
             steps = steps + taken
-        found = _penetration(body, fits)
+        found = _penetration(body, fits, rest)
         if _rank(found) < _rank(after):
             best, after = fits, found
         if not any(_rank(after)[:2]):
@@ -172,19 +179,23 @@ def _descend_together(
     return found, end.steps
 
 
-def _penetration(body: BodyModel, fits: FitResult) -> Penetration:
+def _penetration(body: BodyModel, fits: FitResult, rest: RestSurface) -> Penetration:
     scene = join_bodies(fits.vertices, body.faces)
     count = len(fits.vertices)
-    rest = body.rest_surface if count == 1 else body.rest_surface.copies(count)
+    rest = rest if count == 1 else rest.copies(count)
     found = {}
     for name, ignored in (("between", within_groups(count)), ("within", between_groups(count))):
-        report = intersection_report(
-            scene.vertices,
-            scene.faces,
-            face_groups=scene.face_groups,
-            ignore_groups=ignored,
-            folds=rest,
-        )
+        try:
+            report = intersection_report(
+                scene.vertices,
+                scene.faces,
+                face_groups=scene.face_groups,
+                ignore_groups=ignored,
+                folds=rest,
+            )
+        except Unmeasurable:
+            nothing, none = jnp.asarray(jnp.nan, jnp.float32), jnp.asarray(-1)
+            return Penetration(nothing, nothing, none, none)
         found[name] = jnp.asarray(report.volume, jnp.float32)
         found[f"crossings_{name}"] = jnp.asarray(report.crossing_pairs[0])
     return Penetration(**found)

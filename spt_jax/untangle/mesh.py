@@ -10,23 +10,21 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax.arguments import as_directions, as_rays
 from spt_jax.mesh_check import check_mesh, one_mesh
-from spt_jax.overlap.measure import Directions, Sampling, measure
-from spt_jax.overlap.triangles.pairs import edge_crossings
-from spt_jax.untangle.freeing import free_vertices
+from spt_jax.overlap.measure import Sampling
+from spt_jax.overlap.vectors import area_normals, dot
+from spt_jax.untangle.freeing import Freed, Place, free_vertices
+from spt_jax.untangle.results import RESULTS, in_words
 from spt_jax.untangle.spread import Surface
-
-# The search needs no more: the last crossings go by their contours, which no ray has to see.
-SEARCH_RAYS = 256
 
 
 @dataclass(frozen=True)
 class MeshOverlap:
-    """How much of a mesh is in self-intersection.
+    """How much of a mesh is in self-intersection, measured exactly.
 
     Attributes:
         volume: the overlap volume, in the cube of the mesh's unit.
         ratio: the part of the vertices in it (paper, Eq. 11).
-        crossings: how often an edge passes through a triangle that it does not touch.
+        crossings: pairs of triangles that intersect; those that only touch do not.
     """
 
     volume: float
@@ -43,7 +41,13 @@ class UntangleMeshResult:
         before, after: the overlap of the mesh given and of the mesh found.
         moved: how many vertices are not where they were.
         median_displacement, largest_displacement: of those, in the mesh's unit; 0.0 for none.
+        relative_displacement: the largest displacement against the size of the connected part that
+            it belongs to, the diagonal of the box around it; at most 1.
+        inverted_parts: connected parts that were turned inside out; always 0, because such a mesh
+            is not returned.
+        flipped_triangles: triangles whose normal turned by more than 90 degrees.
         steps: of the search, over all attempts.
+        result: how it ended, one of `spt_jax.untangle.results.RESULTS`.
 
     Example:
         >>> import trimesh
@@ -61,22 +65,35 @@ class UntangleMeshResult:
     moved: int
     median_displacement: float
     largest_displacement: float
+    relative_displacement: float
+    inverted_parts: int
+    flipped_triangles: int
     steps: int
+    result: RESULTS
 
     @property
     def free(self) -> bool:
-        """Whether no edge passes through a triangle any more."""
-        return self.after.crossings == 0
+        """Whether no triangles intersect, nothing overlaps, and no part was turned inside out."""
+        return bool(self.result == RESULTS.successful)
+
+    @property
+    def reason(self) -> str:
+        """The result in words."""
+        return in_words(self.result)
 
     def as_dict(self) -> dict[str, Any]:
         """All but the vertices, for JSON."""
         return {
             "free": self.free,
+            "reason": self.reason,
             "before": asdict(self.before),
             "after": asdict(self.after),
             "moved": self.moved,
             "median_displacement": self.median_displacement,
             "largest_displacement": self.largest_displacement,
+            "relative_displacement": self.relative_displacement,
+            "inverted_parts": self.inverted_parts,
+            "flipped_triangles": self.flipped_triangles,
             "steps": self.steps,
         }
 
@@ -85,13 +102,13 @@ def untangle_mesh(
     vertices: Float[Array, "V 3"] | np.ndarray,
     faces: Int[Array, "F 3"] | np.ndarray,
     *,
-    rays: int = SEARCH_RAYS,
+    rays: int | tuple[int, int] | str = "auto",
     directions: Any = 3,
     attempts: int = 4,
     steps_per_attempt: int = 40,
     on_step: Callable[[int, int, int], None] | None = None,
 ) -> UntangleMeshResult:
-    r"""The mesh with its vertices moved until no triangle passes through another.
+    r"""The mesh with its vertices moved until no triangles intersect, and never a worse one.
 
     Each region of overlap takes Newton steps towards no volume along the gradient g of
     `self_intersection_penalty`: of all displacements u with g . u = -V to first order, the one of
@@ -100,36 +117,45 @@ def untangle_mesh(
         \|u\|^2 + \|s^2 L u / 6\|^2,
 
     the thin-plate energy of Botsch and Sorkine 2008 ("On linear variational surface deformation
-    methods") with the graph's Laplacian L; s grows with the region. What the rays do not see any
-    more, the last crossings of folds above all, goes by shortening the curve along which the
-    surface crosses itself (Volino and Magnenat-Thalmann 2006, "Resolving surface collisions
-    through intersection contour minimization"). Where an attempt leaves crossings, the next
-    starts anew with twice the s there. At the end the displacement of each part is scaled down as
-    far as the mesh stays free. Only vertices around intersections move.
+    methods") with the graph's Laplacian L; s grows with the region. What has next to no volume, the
+    last intersections of folds above all, goes by shortening the curve along which the surface
+    intersects itself (Volino and Magnenat-Thalmann 2006, "Resolving surface collisions through
+    intersection contour minimization"). Where an attempt leaves intersections, the next starts anew
+    with twice the s there; where none leaves nothing, connected parts that intersect each other are
+    pushed apart as they are. At the end the displacement of each part is scaled down as far as the
+    mesh stays free, and vertices to which it has all but faded go back.
 
-    A part that lies within another whole has overlap, but crosses nothing, and is left there:
-    `after.volume` tells.
+    Every place that the search comes by is measured exactly. It is taken only where it has neither
+    more intersecting pairs nor more overlap than the mesh given, and where no connected part is
+    inside out, or within another, that was not before. Parts that intersect nothing do not move,
+    and no vertex moves farther than its part is large.
+
+    Contact is no intersection: solids that touch, and flat faces that lie on each other, stay as
+    they are. A part that lies within another whole, or upon a copy of its own, overlaps it but
+    intersects nothing; it is left there and told: `free` is False then.
 
     Args:
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
             must be closed and consistently wound; it need not be connected.
-        rays: as in `self_intersection_penalty`, for the search; more do not free more.
+        rays: as in `self_intersection_penalty`, for the gradient that the search follows; what is
+            compared and told is exact in any case.
         directions: as in `self_intersection_penalty`.
         attempts: at most so many, each from the vertices given.
         steps_per_attempt: at most so many steps in each attempt.
         on_step: called before each step with the index of the attempt, the steps so far and the
-            number of crossings.
+            number of pairs of triangles that are to be parted.
 
     Returns:
-        The first attempt's vertices that are free of crossings, else those with the fewest: look
-        at `free`. A mesh without crossings comes back to the bit, and so do vertices far from any.
+        The first attempt's vertices that are free, else the best that were seen: look at `free`. A
+        mesh without intersections comes back to the bit, and so do vertices far from any.
 
     Raises:
         TypeError: vertices not float32 or float64, or traced; faces not whole numbers; rays or
             directions that are no numbers.
         ValueError: wrong shapes; a mesh that is not closed and consistently wound, that is inside
-            out or not finite; rays, attempts or steps_per_attempt not positive.
+            out or not finite; `spt_jax.overlap.measure.Unmeasurable` for one that is too crumpled,
+            or too far from the origin; rays, attempts or steps_per_attempt not positive.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
 
@@ -170,15 +196,20 @@ def untangle_checked(
     *,
     attempts: int = 4,
     steps_per_attempt: int = 40,
+    whole_parts: bool = True,
     on_step: Callable[[int, int, int], None] | None = None,
 ) -> UntangleMeshResult:
     """`untangle_mesh` for a mesh that is known to be fit: many poses of one body, say.
 
     Args:
-        vertices: finite positions.
+        vertices: positions.
         surface: of the body's faces, made once.
-        sampling: the rays.
+        sampling: how the gradient is measured.
         attempts, steps_per_attempt, on_step: as in `untangle_mesh`.
+        whole_parts: whether connected parts are pushed apart as they are where no attempt did.
+
+    Raises:
+        Unmeasurable: there is no surface that could be measured.
     """
     found = free_vertices(
         surface,
@@ -186,35 +217,46 @@ def untangle_checked(
         sampling,
         attempts=attempts,
         steps_per_attempt=steps_per_attempt,
+        whole_parts=whole_parts,
         on_step=on_step or _nothing,
     )
-    freed = found.vertices.astype(vertices.dtype)  # exact: the search ends on values of this dtype
-    shift = np.linalg.norm(found.vertices - vertices.astype(np.float64), axis=1)
-    shift = shift[shift > 0]
-    before = _overlap(vertices, surface, sampling.directions)
+    start, best = found.start.vertices, found.best.vertices
+    shift = best - start
+    far, size = surface.farthest(shift), surface.part_sizes(start)
+    length = np.linalg.norm(shift, axis=1)
+    length = length[length > 0]
     return UntangleMeshResult(
-        vertices=freed,
-        before=before,
-        after=_overlap(freed, surface, sampling.directions) if len(shift) else before,
-        moved=len(shift),
-        median_displacement=float(np.median(shift)) if len(shift) else 0.0,
-        largest_displacement=float(shift.max(initial=0.0)),
+        # Exact: the search ends on values of this dtype. What did not move is what was given.
+        vertices=best.astype(vertices.dtype) if len(length) else vertices.copy(),
+        before=_overlap(found.start),
+        after=_overlap(found.best),
+        moved=len(length),
+        median_displacement=float(np.median(length)) if len(length) else 0.0,
+        largest_displacement=float(length.max(initial=0.0)),
+        relative_displacement=float((far / np.where(size > 0, size, 1.0)).max(initial=0.0)),
+        inverted_parts=found.best.inverted,
+        flipped_triangles=_flipped(start, best, surface),
         steps=found.steps,
+        result=_result(found),
     )
 
 
-def _overlap(
-    vertices: Float[np.ndarray, "V 3"], surface: Surface, directions: Directions
-) -> MeshOverlap:
-    points = vertices.astype(np.float64)
-    if not len(surface.faces):
-        return MeshOverlap(0.0, 0.0, 0)
-    found = measure(points, surface.faces, Sampling("auto", directions))
-    return MeshOverlap(
-        volume=float(found.volume),
-        ratio=float(np.mean(found.labels("vertex") != 0)),
-        crossings=len(edge_crossings(points, surface.faces).face),
-    )
+def _result(found: Freed) -> Any:
+    if not found.best.pairs:
+        return RESULTS.successful if found.best.volume == 0 else RESULTS.enclosed
+    if found.diverged:
+        return RESULTS.nonlinear_divergence
+    return RESULTS.nonlinear_max_steps_reached if found.ran_out else RESULTS.intersections_left
+
+
+def _overlap(place: Place) -> MeshOverlap:
+    ratio = float(np.mean(place.labels != 0)) if len(place.labels) else 0.0
+    return MeshOverlap(place.volume, ratio, place.pairs)
+
+
+def _flipped(before, after, surface: Surface) -> int:
+    first, second = (area_normals(points, surface.faces) for points in (before, after))
+    return int(np.count_nonzero(dot(first, second) < 0))
 
 
 def _nothing(attempt: int, steps: int, crossings: int) -> None:

@@ -9,17 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
+from spt_jax.exclusions import as_fold_surface
 from spt_jax.geometry import inflate
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.overlap.measure import Sampling, measure
+from spt_jax.overlap.measure import Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.penalty import self_intersection_penalty
 from spt_jax.rest_surface import RestSurface
-from spt_jax.untangle.mesh import SEARCH_RAYS, untangle_checked
+from spt_jax.untangle.mesh import untangle_checked
+from spt_jax.untangle.results import RESULTS, in_words
 from spt_jax.untangle.spread import Surface
 
 Folds = Literal["ignore", "remove", "count"]
@@ -41,6 +43,9 @@ _CENTIMETRE = 0.01
 _WIDER = (2.0, 4.0)
 _AGAIN = 2
 
+# A pose that turns a joint by more than a full turn, in radians, is no pose near the one given.
+_MOST_TURN = 2 * np.pi
+
 
 class Overlap(eqx.Module):
     """How much of a body is in self-intersection.
@@ -49,7 +54,7 @@ class Overlap(eqx.Module):
         volume: the overlap volume that counts, in m^3: without folds, unless they count.
         total_volume: the same with folds.
         ratio: the part of the vertices in overlaps that count (paper, Eq. 11).
-        crossings: pairs of triangles that pass through each other and count.
+        crossings: pairs of triangles that intersect and count; those that only touch do not.
         total_crossings: the same with folds.
     """
 
@@ -68,6 +73,7 @@ class UntangleResult(eqx.Module):
         vertices: the body in that pose, in metres; with folds="remove" its vertices were moved on.
         before, after: the overlap of the pose given and of what was found.
         steps: of the solver, over all weights.
+        result: how it ended, one of `spt_jax.untangle.results.RESULTS` for each pose.
     """
 
     pose: Float[Array, "*batch J 3"]
@@ -75,6 +81,17 @@ class UntangleResult(eqx.Module):
     before: Overlap
     after: Overlap
     steps: Int[Array, "*batch"]
+    result: RESULTS
+
+    @property
+    def free(self) -> Bool[Array, "*batch"]:
+        """Whether nothing collides any more; with folds="remove", whether nothing intersects."""
+        return self.result == RESULTS.successful
+
+    @property
+    def reason(self) -> Any:
+        """The result in words: a string, or nested lists of strings over the batch axes."""
+        return in_words(self.result)
 
 
 def untangle_pose(
@@ -84,6 +101,7 @@ def untangle_pose(
     shape: Float[Array, "*#batch B"] | Float[np.ndarray, "*#batch B"] | None = None,
     translation: Float[Array, "*#batch 3"] | Float[np.ndarray, "*#batch 3"] | None = None,
     folds: Folds = "ignore",
+    fold_distance: float | None = None,
     margin: float = 0.002,
     rays: int | str = "auto",
     directions: int | Float[np.ndarray, "D 3"] = 3,
@@ -116,6 +134,8 @@ def untangle_pose(
             is freed of collisions, then `untangle_mesh` moves the vertices until the surface
             crosses itself nowhere. "count": they are no different from collisions; the pose has
             to open them, at the price of a visible change, and no margin is kept.
+        fold_distance: how near to each other, along the rest surface and in metres, sheets are
+            folds; everywhere the same. None: `body.rest_surface` says, place by place.
         margin: how far apart colliding parts are pushed, in metres.
         rays: as in `self_intersection_penalty`; a number is what the search uses, and what is
             compared and reported is measured with twice as many.
@@ -131,15 +151,19 @@ def untangle_pose(
     Returns:
         The pose with the fewest crossings, and of those the least overlap, of those measured after
         each weight, never worse than the one given; a pose in which nothing collides comes back
-        unchanged.
+        unchanged. `result` says how it ended, `free` whether it did well. Where the solver runs
+        away, to numbers that are not finite or to joints turned by more than a full turn, that
+        place is not taken, and the next weight starts from the last one that could be measured.
 
     Raises:
         ValueError: pose of another shape than (..., J, 3) or with values that are not finite;
             shape or translation that is not finite or does not fit pose's batch axes; no weights,
             or weights that are not positive and finite; steps_per_weight not positive; more than
-            2048 rays, or fewer than one; an unknown way with folds; margin negative or not finite;
-            directions as in `self_intersection_penalty`.
-        TypeError: pose traced; rays, margin or directions that are no numbers.
+            2048 rays, or fewer than one; an unknown way with folds; margin or fold_distance
+            negative or not finite; directions as in `self_intersection_penalty`;
+            `spt_jax.overlap.measure.Unmeasurable` for a pose given in which the body has no surface
+            that could be measured.
+        TypeError: pose traced; rays, margin, fold_distance or directions that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
 
@@ -148,8 +172,8 @@ def untangle_pose(
         >>> body, mocap = load_body(), load_mocap()
         >>> pose = body.pose_from_smpl(mocap.pose[mocap.names.index("cartwheel/0103")])
         >>> result = untangle_pose(body, pose)
-        >>> int(result.before.crossings) > 0, int(result.after.crossings)
-        (True, 0)
+        >>> int(result.before.crossings) > 0, int(result.after.crossings), result.reason
+        (True, 0, 'free')
     """
     pose = jnp.asarray(pose)
     if pose.shape[-2:] != (body.num_joints, 3):
@@ -179,6 +203,7 @@ def untangle_pose(
         if array is not None and not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite: got {np.asarray(array)!r}.")
     way = as_choice("folds", folds, Folds)
+    rest = None if way == "count" else as_fold_surface(body, fold_distance)
     search = _Search(
         rays=_as_search_rays(rays),
         directions=as_directions(directions),
@@ -188,7 +213,7 @@ def untangle_pose(
         steps_per_weight=int(steps_per_weight),
         tolerance=float(tolerance),
         solver=solver or optx.BFGS(rtol=1e-3, atol=1e-3),
-        rest=None if way == "count" else body.rest_surface,
+        rest=rest,
     )
     poses = pose.reshape(-1, *pose.shape[-2:])
     shapes = _per_pose("shape", shape, batch, len(poses))
@@ -222,28 +247,30 @@ class _Search(eqx.Module):
         return 2 * self.rays if isinstance(self.rays, int) else "auto"
 
     def measure(self, vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Overlap:
-        """The overlap of a posed body."""
+        """The overlap of a posed body.
+
+        Raises:
+            Unmeasurable: there is none that could be measured.
+        """
         dtype = vertices.dtype
         found = measure(
             np.asarray(vertices, np.float64),
             np.asarray(faces, np.int64),
             Sampling(self.measured_rays, self.directions),
             Exclusions(rest=self.rest),
+            float(jnp.finfo(dtype).eps),
         )
         return Overlap(
             volume=jnp.asarray(found.volume, dtype),
             total_volume=jnp.asarray(found.total_volume, dtype),
             ratio=jnp.asarray(np.mean(found.labels("vertex") != 0), dtype),
             crossings=jnp.asarray(found.crossing_pairs, jnp.int32),
-            total_crossings=jnp.asarray(len(found.sheets.pairs), jnp.int32),
+            total_crossings=jnp.asarray(found.total_crossing_pairs, jnp.int32),
         )
 
     def rank(self, overlap: Overlap) -> tuple[int, float]:
         """Sorts overlaps, the best first."""
-        volume = float(overlap.volume)
-        if not np.isfinite(volume):
-            return np.iinfo(np.int64).max, np.inf
-        return (0 if self.folds == "count" else int(overlap.crossings)), volume
+        return (0 if self.folds == "count" else int(overlap.crossings)), float(overlap.volume)
 
     def is_free(self, overlap: Overlap) -> bool:
         """Whether there is nothing left to do."""
@@ -277,12 +304,13 @@ def _untangle_one(
     vertices = body(pose, shape, translation).vertices
     before = search.measure(vertices, body.faces)
     best, after, steps = pose, before, 0
+    ended, diverged = RESULTS.successful, False
     if not search.is_free(before):
         factor = _displacement_factor(body, pose, shape)
         moved = jnp.zeros(factor.shape[:1], pose.dtype)
         idle = 0
         for stage, (margin, weight) in enumerate(search.attempts()):
-            moved, taken = _descend(
+            there, taken, ended = _descend(
                 search,
                 body,
                 (pose, shape, translation, factor),
@@ -291,28 +319,60 @@ def _untangle_one(
                 jnp.asarray(weight, pose.dtype),
             )
             steps += int(taken)
-            candidate = turned(pose, factor, moved)
-            posed = body(candidate, shape, translation).vertices
-            overlap = search.measure(posed, body.faces)
-            gained = search.rank(overlap) < search.rank(after)
+            candidate = turned(pose, factor, there)
+            found = _measured(search, body, pose, candidate, shape, translation)
+            if found is None:
+                diverged = True
+                on_step(stage, steps, float("nan"))
+                continue
+            moved, (posed, overlap) = there, found
             falls = float(overlap.volume) < 0.99 * float(after.volume)
             idle = 0 if falls else idle + 1
-            if gained:
+            if search.rank(overlap) < search.rank(after):
                 best, after, vertices = candidate, overlap, posed
             on_step(stage, steps, float(overlap.volume))
             # The first weights may be too weak to move anything; two in a row that gain nothing
             # after that mean that the volume no longer falls.
             stuck = search.folds == "count" and idle >= 2 and stage > 2
-            if search.is_free(after) or stuck or not np.isfinite(overlap.volume):
+            if search.is_free(after) or stuck:
                 break
+    free = search.is_free(after)
     if surface is not None and int(after.total_crossings):
-        sampling = Sampling(SEARCH_RAYS, search.directions)
-        freed = untangle_checked(np.asarray(vertices), surface, sampling).vertices
-        vertices = jnp.asarray(freed)
-        after = search.measure(vertices, body.faces)
+        sampling = Sampling("auto", search.directions)
+        skin = untangle_checked(np.asarray(vertices), surface, sampling)
+        if skin.moved:
+            vertices = jnp.asarray(skin.vertices)
+            after = search.measure(vertices, body.faces)
+        free, ended = skin.free, skin.result
     return UntangleResult(
-        pose=best, vertices=vertices, before=before, after=after, steps=jnp.asarray(steps)
+        pose=best,
+        vertices=vertices,
+        before=before,
+        after=after,
+        steps=jnp.asarray(steps),
+        result=_result(free, diverged, ended),
     )
+
+
+def _measured(search: _Search, body, pose, candidate, shape, translation):
+    """The vertices and the overlap of a pose, or None where it has run away."""
+    if not float(jnp.max(jnp.linalg.norm(candidate - pose, axis=-1))) <= _MOST_TURN:  # NaN is not
+        return None
+    posed = body(candidate, shape, translation).vertices
+    try:
+        return posed, search.measure(posed, body.faces)
+    except Unmeasurable:
+        return None
+
+
+def _result(free: bool, diverged: bool, ended: Any) -> Any:
+    if free:
+        return RESULTS.successful
+    if diverged:
+        return RESULTS.nonlinear_divergence
+    if ended == RESULTS.successful:
+        return RESULTS.intersections_left
+    return ended
 
 
 @eqx.filter_jit
@@ -354,7 +414,7 @@ def _descend(search: _Search, body, fixed, moved, margin, weight):
         max_steps=search.steps_per_weight,
         throw=False,
     )
-    return solution.value, solution.stats["num_steps"]
+    return solution.value, solution.stats["num_steps"], RESULTS.promote(solution.result)
 
 
 def _per_pose(name, array, batch, count):

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from spt_jax.mesh_edges import connected
+from spt_jax.overlap.vectors import cross, dot, summed
 
 
 class Surface:
@@ -39,6 +40,49 @@ class Surface:
         links.data[:] = 1.0
         self.neighbours: Any = links
         self.laplacian: Any = scipy.sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
+
+    @cached_property
+    def part(self) -> Int[np.ndarray, "V"]:
+        """The connected part of each vertex, numbered from 0."""
+        return scipy.sparse.csgraph.connected_components(self.neighbours, directed=False)[1]
+
+    @cached_property
+    def num_parts(self) -> int:
+        """How many connected parts there are; a vertex of no triangle is one."""
+        return int(self.part.max(initial=-1)) + 1
+
+    def part_sums(self, values: Shaped[np.ndarray, "F"]) -> Float[np.ndarray, "N"]:
+        """The sum over the faces of each connected part."""
+        return np.bincount(self.part[self.faces[:, 0]], values, self.num_parts)
+
+    def part_senses(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "N"]:
+        """-1 for each connected part that is inside out, else +1; 0 for one without volume."""
+        count = np.maximum(np.bincount(self.part, minlength=self.num_parts), 1)
+        middle = summed(self.part, vertices, self.num_parts) / count[:, None]
+        a, b, c = (vertices - middle[self.part])[self.faces].transpose(1, 0, 2)
+        each = dot(a, cross(b, c))
+        volume, rounding = self.part_sums(each), 1e-12 * self.part_sums(np.abs(each))
+        return np.where(np.abs(volume) > rounding, np.sign(volume), 0.0)
+
+    def part_boxes(
+        self, vertices: Float[np.ndarray, "V 3"]
+    ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+        """The lowest and the highest corner of the box around each connected part."""
+        low, high = np.full((2, self.num_parts, 3), np.inf)
+        np.minimum.at(low, self.part, vertices)
+        np.minimum.at(high, self.part, -vertices)
+        return low, -high
+
+    def part_sizes(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "N"]:
+        """The diagonal of the box around each connected part."""
+        low, high = self.part_boxes(vertices)
+        return np.linalg.norm(high - low, axis=1)
+
+    def farthest(self, shift: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "N"]:
+        """The largest displacement in each connected part."""
+        far = np.zeros(self.num_parts)
+        np.maximum.at(far, self.part, np.linalg.norm(shift, axis=1))
+        return far
 
     def within(self, start: Int[np.ndarray, "M"], most: int) -> Int[np.ndarray, "_"]:
         """Vertices at most so many edges away from those of `start`, themselves included."""

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from spt_jax.arguments import as_directions
 from spt_jax.overlap.measure import Sampling
-from spt_jax.untangle.mesh import SEARCH_RAYS, untangle_checked
+from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.pose import turned, untangle_pose
 from spt_jax.untangle.spread import Surface
 from spt_jax.view.scene import Scene
@@ -101,6 +101,9 @@ def untangle_scene(scene: Scene, show: Show, stopped: Callable[[], bool]) -> Non
         scene: changed to what was found; to the step last shown where stopped.
         show: called with vertices and a line of text, from another thread too.
         stopped: asked between steps, or between the weights of a pose.
+
+    Raises:
+        Unmeasurable: there is nothing to measure in what the scene shows.
     """
     try:
         if scene.body is not None:
@@ -157,16 +160,17 @@ def _free_vertices(scene: Scene, show: Show, stopped: Callable[[], bool]) -> Non
     # where a long one passes; the first that frees the mesh has found what the long one finds.
     vertices = scene.vertices
     surface = Surface(scene.faces, len(vertices))
-    sampling = Sampling(SEARCH_RAYS, as_directions(3))
+    sampling = Sampling("auto", as_directions(3))
 
-    def on_step(attempt: int, steps: int, crossings: int) -> None:
+    def on_step(attempt: int, steps: int, pairs: int) -> None:
         if stopped():
             raise Stopped
 
     for steps in (*_MESH_LOOKS, None):
-        most = {} if steps is None else {"attempts": 1, "steps_per_attempt": steps}
+        looks = {"attempts": 1, "steps_per_attempt": steps, "whole_parts": False}
+        most = {} if steps is None else looks
         found = untangle_checked(vertices, surface, sampling, on_step=on_step, **most)
         scene.set_free_vertices(found.vertices)
-        show(found.vertices, f"step {found.steps}, {found.after.crossings} crossings")
-        if found.free:
+        show(found.vertices, f"step {found.steps}, {found.after.crossings} intersecting pairs")
+        if not found.after.crossings:
             return

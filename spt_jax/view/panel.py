@@ -211,13 +211,15 @@ def _within(slider: Any, value: float) -> float:
 def figures(reading: Reading, scene: Scene, status: str) -> str:
     """What was measured, as HTML."""
     volume, ratio = volume_text(reading.volume, scene), f"{reading.counts.ratio:.2%}"
+    if reading.error is not None:
+        volume = ratio = "not measured"
     large, small = (ratio, volume) if scene.paper else (volume, ratio)
     large_name, small_name = ("ratio (Eq. 11)", "overlap volume")[:: 1 if scene.paper else -1]
     rows = [
         (small_name, small),
         (f"{_dot(OUT_COLOUR)} within another part, V<sub>out</sub>", f"{reading.counts.out}"),
         (f"{_dot(IN_COLOUR)} inside out, V<sub>in</sub>", f"{reading.counts.inside}"),
-        ("triangle pairs that cross", f"{reading.crossing_pairs}"),
+        ("triangle pairs that intersect", f"{reading.crossing_pairs}"),
         ("measured in", f"{reading.milliseconds:.0f} ms"),
     ]
     table = "".join(

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax.arguments import as_directions
 from spt_jax.body import BodyModel
+from spt_jax.mesh_files import fits_single
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.overlap.labels import LabelCounts, count_labels
-from spt_jax.overlap.measure import Rule, Sampling, measure
+from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
 
 _EXACT = Sampling("auto", as_directions(3))
 # The paper's own settings, `paper_penalty`: 512 rays along -z.
@@ -34,8 +35,10 @@ class Reading:
         vertices: the positions that were measured.
         labels: 0 on V_0, +1 on V_out, -1 on V_in.
         volume: the overlap volume that counts, in the cube of the vertices' unit.
-        crossing_pairs: pairs of triangles that pass through each other and count.
+        crossing_pairs: pairs of triangles that intersect and count.
         milliseconds: that measuring took.
+        error: why there is nothing to measure, in one line; then the volume is NaN and no vertex is
+            in self-intersection. None: it was measured.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -43,6 +46,12 @@ class Reading:
     volume: float
     crossing_pairs: int
     milliseconds: float
+    error: str | None = None
+
+    @property
+    def free(self) -> bool:
+        """Whether it was measured, no triangles intersect and nothing overlaps."""
+        return self.error is None and not self.crossing_pairs and not self.volume > 0
 
     @property
     def counts(self) -> LabelCounts:
@@ -83,7 +92,7 @@ class Scene:
         self.translation = np.zeros(3, np.float32)
         self.count_folds = self.paper = False
         # Vertices that no pose explains: a mesh's own, or a body's skin freed of its folds.
-        self._free = None if vertices is None else vertices.astype(np.float32)
+        self._free = vertices
         self._posed: tuple[np.ndarray, np.ndarray] | None = None
         self._loaded = self._state()
 
@@ -96,8 +105,12 @@ class Scene:
     def of_mesh(
         cls, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], name: str
     ) -> "Scene":
-        """A mesh, in float32 as the files that are written hold it."""
-        return cls(name, faces, vertices=vertices)
+        """A mesh, in float32 as the files that are written hold it.
+
+        In float64 where it lies so far from the origin that rounding would show.
+        """
+        single = vertices.astype(np.float32) if fits_single(vertices) else vertices
+        return cls(name, faces, vertices=single)
 
     def load(
         self,
@@ -145,7 +158,7 @@ class Scene:
 
     def set_free_vertices(self, vertices: Float[np.ndarray, "V 3"]) -> None:
         """Show these vertices; a body goes back to its posed ones as soon as its pose changes."""
-        self._free = np.array(vertices, np.float32)
+        self._free = np.array(vertices)
 
     @property
     def vertices(self) -> Float[np.ndarray, "V 3"]:
@@ -163,7 +176,11 @@ class Scene:
         return np.roll(np.array(quaternions).reshape(-1, 4), 1, axis=1)
 
     def read(self, vertices: Float[np.ndarray, "V 3"] | None = None) -> Reading:
-        """Measure the surface, or other vertices of it: NumPy alone, so from any thread."""
+        """Measure the surface, or other vertices of it: NumPy alone, so from any thread.
+
+        A surface that cannot be measured, such as one that is not finite, gives a reading that says
+        so in its `error`.
+        """
         vertices = self.vertices if vertices is None else vertices
         start = time.perf_counter()
         exclusions = NOTHING if self.count_folds else self._without_folds
@@ -211,10 +228,16 @@ def _read(
     rule: Rule,
     start: float,
 ) -> Reading:
-    found = measure(points, faces, sampling, exclusions)
-    volume, labels, pairs = float(found.volume), found.labels(rule), found.crossing_pairs
+    rounding = float(np.finfo(vertices.dtype).eps)
+    error = None
+    try:
+        found = measure(points, faces, sampling, exclusions, rounding)
+        volume, labels, pairs = float(found.volume), found.labels(rule), found.crossing_pairs
+    except Unmeasurable as reason:
+        volume, labels, pairs = float("nan"), np.zeros(len(vertices), np.int8), 0
+        error = " ".join(str(reason).split())
     milliseconds = 1e3 * (time.perf_counter() - start)
-    return Reading(vertices, labels.astype(np.int8), volume, pairs, milliseconds)
+    return Reading(vertices, labels.astype(np.int8), volume, pairs, milliseconds, error)
 
 
 def body_parts(joint_names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:

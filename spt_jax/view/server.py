@@ -44,8 +44,8 @@ class View:
 
     Raises:
         ImportError: viser is not installed.
-        OSError, ValueError: the file cannot be read, or the host is no address of this machine;
-            nothing is served then.
+        OSError, ValueError: the file cannot be read, holds nothing that could be measured, or the
+            host is no address of this machine; nothing is served then.
     """
 
     def __init__(self, file: Path | None = None, *, host: str = "127.0.0.1", port: int = 8080):
@@ -62,7 +62,12 @@ class View:
         self._motions: dict[str, files.Frames] = {}
         self._embedded = True
         self.worker = Worker(self._refresh, self._report)
-        self._take(opened if opened is not None else _embedded_body(), file, first=True)
+        try:
+            self._take(opened if opened is not None else _embedded_body(), file, first=True)
+        except Exception:
+            with contextlib.redirect_stdout(None):
+                self.server.stop()
+            raise
         self.server.on_client_connect(self._say_notes)
 
     @property
@@ -209,6 +214,8 @@ class View:
         if start is not None:
             motions[start[0]].load_into(scene, start[1])
         reading = scene.read()  # distances along the surface at rest take two seconds, once
+        if reading.error is not None:
+            raise ValueError(reading.error)
         self.scene, self._motions = scene, motions
         self._status = "ready" if start is None else motions[start[0]].names[start[1]]
         self._stage.begin(scene, reading)
@@ -227,8 +234,9 @@ class View:
             self.panel.show_state()
 
     def _show(self, reading: Reading, status: str) -> None:
-        self._stage.show(reading, self.scene.faces)
-        self.panel.show_figures(reading, status)
+        if reading.error is None:
+            self._stage.show(reading, self.scene.faces)
+        self.panel.show_figures(reading, reading.error or status)
 
     def _report(self, error: Exception) -> None:
         message = " ".join(str(error).split())
@@ -278,8 +286,12 @@ def _embedded_body() -> Scene:
 
 
 def _outcome(before: Reading, after: Reading) -> str:
-    if not before.crossing_pairs and not before.volume:
+    if after.error is not None:
+        return after.error
+    if before.free:
         return "nothing to untangle"
-    if not after.crossing_pairs:
+    if after.free:
         return "free"
-    return f"not free: {after.crossing_pairs} pairs of triangles still cross"
+    if not after.crossing_pairs:
+        return "not free: nothing intersects, but a part lies wholly within another"
+    return f"not free: {after.crossing_pairs} pairs of triangles still intersect"

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from spt_jax.arguments import as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
+from spt_jax.exclusions import as_fold_surface
 from spt_jax.fit.figure import Variables
 from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
 from spt_jax.fit.terms.spheres import BodySpheres, sphere_penalty
@@ -106,6 +107,8 @@ class SelfIntersection(Regulariser):
 
     Attributes:
         folds: "ignore" leaves out the creases of skin at joints, "count" counts them as overlap.
+        fold_distance: how near to each other along the rest surface sheets are folds, in metres;
+            None: the body's own distances, place by place.
         margin: how far apart parts are pushed, in metres; 0 measures the surface as it is. As a
             JAX array it may change without compiling anew.
         value, gradient, rule: as in `self_intersection_penalty`. "ratio" with "unit" and "triangle"
@@ -132,6 +135,7 @@ class SelfIntersection(Regulariser):
     weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(0.1, 1.0, 10.0))
     _: dataclasses.KW_ONLY
     folds: Literal["ignore", "count"] = eqx.field(static=True, default="ignore")
+    fold_distance: float | None = eqx.field(static=True, default=None)
     margin: float | Float[Array, ""] = eqx.field(
         default=0.0, converter=lambda given: given if isinstance(given, Array) else as_margin(given)
     )
@@ -152,7 +156,7 @@ class SelfIntersection(Regulariser):
         """With the rest surface that folds are told by."""
         if self.folds == "count":
             return self
-        rest = body.rest_surface
+        rest = as_fold_surface(body, self.fold_distance)
         return dataclasses.replace(self, rest=rest.copies(people) if people > 1 else rest)
 
     def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
