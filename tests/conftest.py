@@ -22,6 +22,9 @@ settings.load_profile("suite")
 # when JAX first compiles, and handed down to workers and to programs that tests start. A jaxlib
 # that does not know one ends the process: so another process is asked.
 _QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
+# jaxlib 0.10.2 crashes (SIGSEGV in slinky::internal::can_fuse, called by ynn_invoke_runtime) where
+# a fit runs under vmap on a processor without AVX-512: its library of fused kernels is left out.
+_QUICK += " --xla_cpu_experimental_ynn_fusion_type="
 if "XLA_FLAGS" not in os.environ:
     flags = os.environ | {"XLA_FLAGS": _QUICK}
     asked = subprocess.run(
