@@ -67,6 +67,7 @@ class ExactOverlap:
 
     @cached_property
     def judged(self) -> Judged | None:
+        """The overlaps that count with a share of their contour; None where nothing is left out."""
         if len(self._layers) < 2:
             return None
         layer, surface = self._layers[1], self.surface
