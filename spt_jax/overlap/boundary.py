@@ -13,34 +13,7 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.rays.beam import Beam
 from spt_jax.overlap.rays.levels import Overlaps
-
-
-def area_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "F 3"]:
-    """Outward normals of the triangles, each as long as twice the triangle's area."""
-    a, b, c = (vertices.take(corner, axis=0) for corner in faces.T)
-    return cross(b - a, c - a)
-
-
-def cross(x: Float[np.ndarray, "K 3"], y: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-    """Cross products of the rows; for some hundreds np.cross takes 37 us, this 16."""
-    out = np.empty(x.shape)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        out[:, k] = x[:, i] * y[:, j]
-        out[:, k] -= x[:, j] * y[:, i]
-    return out
-
-
-def summed(
-    at: Int[np.ndarray, "K"], vectors: Float[np.ndarray, "K C"], count: int
-) -> Float[np.ndarray, "N C"]:
-    """The sum of the vectors at each of `count` places; bincount is far faster than add.at."""
-    total = np.empty((count, vectors.shape[1]))  # of nothing, bincount makes whole numbers
-    for axis in range(vectors.shape[1]):
-        total[:, axis] = np.bincount(at, vectors[:, axis], count)
-    return total
+from spt_jax.overlap.vectors import area_normals, summed
 
 
 def boundary_gradient(
