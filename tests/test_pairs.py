@@ -1,7 +1,6 @@
 """Edges through triangles, against exact arithmetic, IPC Toolkit and the laws of two surfaces."""
 
 import threading
-from itertools import combinations
 
 import ipctk
 import numpy as np
@@ -10,6 +9,7 @@ from helpers import body_faces, box, join, moved, posed_bodies, random_rotation,
 
 from spt_jax.overlap.triangles import pair_boxes, pair_layout
 from spt_jax.overlap.triangles.contours import find_contours
+from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.triangles.pair_layout import prepared
 from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 
@@ -349,7 +349,16 @@ def test_memory_of_meshes_is_bounded(rng):
     for k in range(4, 14):
         edge_crossings(rng.normal(size=(k, 3)), np.array([[0, 1, 2], [1, 2, 3]]))
     assert len(pair_layout._meshes) <= 4
-    assert all(a is not b for a, b in combinations(pair_layout._meshes.values(), 2))
+
+
+def test_vertices_that_no_face_uses_make_another_mesh():
+    """Faces that had to be rewritten are known again for as many vertices alone."""
+    vertices, faces = join(box(), box((0.5,) * 3))
+    faces = np.concatenate([faces, faces[:12]])  # the outer one twice
+    for extra in (0, 3, 0):
+        found = manifold_of(faces, len(vertices) + extra)
+        assert found.origin.max() == len(vertices) + extra - 1
+        assert manifold_of(faces, len(vertices) + extra) is found
 
 
 def test_a_triangle_as_large_as_the_mesh_meets_no_empty_slot():

@@ -8,8 +8,6 @@ might pass through each other along it, where no crossing shows: each is given a
 there. Triangles that list a vertex twice have no area and go.
 """
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,9 +15,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.triangles.faces_cache import FacesCache
 from spt_jax.overlap.vectors import summed
-
-_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,27 +121,9 @@ class Manifold:
         return summed(np.concatenate(at), np.concatenate(rows), count)
 
 
-_manifolds: OrderedDict[int, Manifold] = OrderedDict()
-_lock = threading.Lock()
-_next_key = 0
-
-
 def manifold_of(faces: Int[np.ndarray, "F 3"], count: int) -> Manifold:
     """The faces of `count` vertices rewritten; the last few are kept."""
-    global _next_key
-    with _lock:
-        for key, known in reversed(_manifolds.items()):
-            same = faces is known.given or np.array_equal(known.given, faces)
-            if same and (not known.is_given or len(known.part) == count):
-                _manifolds.move_to_end(key)
-                return known
-    made = _rewritten(faces.astype(np.int64, copy=faces.flags.writeable), count)
-    with _lock:
-        _manifolds[_next_key] = made
-        _next_key += 1
-        while len(_manifolds) > _KEPT:
-            _manifolds.popitem(last=False)
-    return made
+    return _manifolds.of(faces, count)
 
 
 def matched_half_edges(
@@ -231,6 +210,9 @@ def _rewritten(given, count: int) -> Manifold:
         num_parts=num_parts,
         is_given=is_given,
     )
+
+
+_manifolds = FacesCache(_rewritten)
 
 
 def _with_middles(vertex, origin, loops: list[np.ndarray], count: int):

@@ -1,19 +1,17 @@
 """What the search for crossing triangles keeps about a list of faces from one call to the next."""
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.triangles.faces_cache import FacesCache
 from spt_jax.overlap.triangles.manifold import matched_half_edges
 
 # Triangles to a cluster, and clusters to a group. On the posed body 4 make 33,000 pairs of clusters
 # that meet, 16 make 300,000 pairs of triangles in them to look at; 8 make 16,000 and 210,000.
 CLUSTER = 8
-_KEPT_MESHES = 4
 _KEPT_SHAPES = 4
 # Connected parts that are walked from a vertex of theirs; more are found together.
 _MOST_STARTS = 16
@@ -103,31 +101,9 @@ class Prepared:
         return self.layout
 
 
-_meshes: OrderedDict[int, Prepared] = OrderedDict()
-_lock = threading.Lock()
-_next_key = 0
-
-
 def prepared(faces: Int[np.ndarray, "F 3"], count: int) -> Prepared:
-    """What is known about these faces of `count` vertices; found by comparing them all."""
-    global _next_key
-    # Comparing with four meshes at most costs 50 us where a digest of the body's faces costs 600.
-    with _lock:
-        for key, mesh in reversed(_meshes.items()):
-            known = mesh.topology
-            same = faces is known.faces or np.array_equal(known.faces, faces)
-            if same and len(known.closed) == count:
-                _meshes.move_to_end(key)
-                return mesh
-    # Faces that nobody may write to, such as those from `host.py`, are known again as they are.
-    kept = faces.astype(np.int64, copy=faces.flags.writeable)
-    mesh = Prepared(_topology(kept, count))
-    with _lock:
-        _meshes[_next_key] = mesh
-        _next_key += 1
-        while len(_meshes) > _KEPT_MESHES:
-            _meshes.popitem(last=False)
-    return mesh
+    """What is known about these faces of `count` vertices; the last few are kept."""
+    return _meshes.of(faces, count)
 
 
 def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
@@ -174,6 +150,9 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
         fan_start=np.append(0, np.cumsum(np.bincount(faces.ravel(), minlength=count))),
         fan=fan,
     )
+
+
+_meshes = FacesCache(lambda faces, count: Prepared(_topology(faces, count)))
 
 
 def _rows(faces, low, high):
