@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -60,18 +60,23 @@ def checked_out(commit: str) -> Iterator[Path]:
 
 
 class Worker:
-    """A process that measures calls of one tree."""
+    """A process that measures with one tree.
 
-    def __init__(self, tree: Path):
+    Args:
+        tree: where the package is imported from.
+        script: what runs there: it answers each line with a line of JSON.
+    """
+
+    def __init__(self, tree: Path, script: Path = _WORKER):
         self._process = subprocess.Popen(
-            [sys.executable, str(_WORKER), str(tree)],
+            [sys.executable, str(script), str(tree)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
 
-    def measure(self, call: str) -> tuple[float, list[float]]:
-        """Milliseconds of the call, and numbers that tell its result."""
+    def measure(self, call: str) -> tuple[Any, Any]:
+        """What the script answers: of `against_worker.py`, milliseconds and the call's numbers."""
         process = self._process
         if process.stdin is None or process.stdout is None:
             raise ValueError("the worker must have pipes: got none.")

@@ -4,10 +4,6 @@ All but the rays of an earlier tree start from the same regions, contours and tr
 """
 
 import functools
-import json
-import subprocess
-import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +14,6 @@ from spt_jax.exclusions import as_exclusions
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.surface import ExactSurface
 
-_WORKER = Path(__file__).with_name("folds_worker.py")
 _ROUNDING = float(np.finfo(np.float64).eps)
 # The ramp ends at so many times the distance at which it begins.
 _RAMP = 1.5
@@ -144,30 +139,3 @@ def slope_with_shares_held(pieces: Pieces) -> Float[np.ndarray, "V 3"]:
     held = ExactOverlap(overlap.surface, overlap._exclusions)
     held.__dict__["judged"] = overlap.judged._replace(volume=0 * overlap.judged.volume)
     return held.gradient()
-
-
-class Earlier:
-    """Volumes as an earlier tree measures them, in a process of its own."""
-
-    def __init__(self, tree: Path):
-        self._process = subprocess.Popen(
-            [sys.executable, str(_WORKER), str(tree)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def measure(self, file: Path) -> tuple[list[float], float]:
-        """Of the meshes `vertices` (N, V, 3) in an .npz file, and seconds for each."""
-        process = self._process
-        if process.stdin is None or process.stdout is None:
-            raise ValueError("the worker must have pipes: got none.")
-        print(file, file=process.stdin, flush=True)
-        answer = process.stdout.readline()
-        if not answer:
-            raise RuntimeError(f"{file} must be measured: the worker stopped with no answer.")
-        return tuple(json.loads(answer))
-
-    def close(self) -> None:
-        """End it."""
-        self._process.communicate()

@@ -23,10 +23,9 @@ import jax
 import numpy as np
 import tyro
 
-from benchmarks.against import checked_out
+from benchmarks.against import Worker, checked_out
 from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.fold_candidates import (
-    Earlier,
     Pieces,
     Ramp,
     as_built,
@@ -38,6 +37,7 @@ from benchmarks.oracles import FAR, RestGraph, far_crossings
 from spt_jax import load_body, load_mocap, self_intersection_penalty
 from spt_jax.rest_surface import local_distances
 
+_WORKER = Path(__file__).with_name("folds_worker.py")
 NOTHING = 0.0  # m^3: the law, not a tolerance
 LEAST_SEEN, LEAST_SILENT = 1.0, 1.0
 HANDS = Path(__file__).resolve().parents[1] / "tests" / "data" / "hands.json"
@@ -249,7 +249,7 @@ class Candidate(NamedTuple):
     measure: Callable[[np.ndarray], tuple[list[float], float]]
 
 
-def candidates(earlier: Earlier | None, folder: Path) -> list[Candidate]:
+def candidates(earlier: Worker | None, folder: Path) -> list[Candidate]:
     """As built and the others; those of this tree share the time of finding what intersects."""
     body = load_body()
     faces, rest = np.asarray(body.faces, np.int64), body.rest_surface
@@ -268,7 +268,7 @@ def candidates(earlier: Earlier | None, folder: Path) -> list[Candidate]:
     def before(meshes: np.ndarray):
         file = folder / "meshes.npz"
         np.savez(file, vertices=meshes)
-        volumes, seconds = earlier.measure(file) if earlier else ([], 0.0)
+        volumes, seconds = earlier.measure(str(file)) if earlier else ([], 0.0)
         return volumes, 1e3 * seconds
 
     ramp = Ramp(rest)
@@ -442,7 +442,7 @@ def laws(settings: Settings, frames: Sequence[Frame]) -> list[Table]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         earlier = None
         if settings.earlier:
-            earlier = Earlier(stack.enter_context(checked_out(settings.earlier)))
+            earlier = Worker(stack.enter_context(checked_out(settings.earlier)), _WORKER)
             stack.callback(earlier.close)
         found = candidates(earlier, folder)
         return [
