@@ -49,7 +49,7 @@ def url():
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        assert line.startswith(f"open http://127.0.0.1:{port} "), line
+        assert line.startswith(f"open http://127.0.0.1:{port}/?token="), line
         yield line.split()[1]
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0

@@ -12,6 +12,7 @@ def view(
     file: tyro.conf.Positional[Path | None] = None,
     port: int = 8080,
     host: str = "127.0.0.1",
+    upload_limit: int = 256,
     quiet: bool = False,
 ) -> int:
     """Look at a body or a mesh in the browser, bend it, and watch it come free.
@@ -23,12 +24,15 @@ def view(
         file: poses (.npz), a mesh (.ply, .obj, .stl, .off, .glb), or an SMPL, SMPL-H or SMPL-X
             model (.npz, .pkl); the body that comes with the package if not given.
         port: of the page; the next free one if it is taken.
-        host: the address to serve on. Whoever can reach it can use the view: 0.0.0.0 lets the
-            whole network in.
-        quiet: print errors alone.
+        host: the address to serve on. Other machines reach a view on 0.0.0.0, without encryption;
+            whoever has the address that is printed, with its token, can use it.
+        upload_limit: what a file that the browser sends may have, in megabytes.
+        quiet: print the address and errors alone.
     """
     if not 0 < port < 65536:
         raise CommandError(f"port must be from 1 to 65535: got {port}.")
+    if upload_limit < 1:
+        raise CommandError(f"upload_limit must be at least 1 MB: got {upload_limit}.")
     show(err_console(quiet), "loading the body")
     from spt_jax.view.server import View, import_viser
 
@@ -37,9 +41,13 @@ def view(
     except ImportError as error:
         raise CommandError(" ".join(str(error).split())) from error
     with user_errors():
-        served = View(file, host=host, port=port)
+        served = View(file, host=host, port=port, upload_limit=upload_limit)
     served.start()
-    show(out_console(quiet), f"open {served.url} in a browser; Ctrl-C ends it")
+    # Always: nobody gets in without the token.
+    show(out_console(), f"open {served.url} in a browser; Ctrl-C ends it")
+    if served.access.beyond:
+        elsewhere = served.url_elsewhere
+        show(err_console(quiet), f"from another machine: {elsewhere}; nothing of it is encrypted")
     try:
         while True:
             time.sleep(3600)

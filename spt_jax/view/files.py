@@ -1,9 +1,11 @@
 """Files that the live view reads, whatever they hold, and what it hands out."""
 
+import re
+import secrets
 import tempfile
 import zipfile
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +16,9 @@ from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.mesh_check import check_mesh
 from spt_jax.mesh_files import read_mesh, write_mesh
 from spt_jax.view.scene import Reading, Scene
+
+_SUFFIX = re.compile(r"\.[a-z0-9]{1,8}", re.ASCII)
+_LONGEST_NAME = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +37,13 @@ class Frames:
         scene.load(self.pose[row], shape, translation)
 
 
-def open_file(path: Path) -> Scene | PoseFile:
+def open_file(path: Path, name: str | None = None) -> Scene | PoseFile:
     """What a file holds: a mesh or a body as a scene, or poses.
 
     Args:
         path: .pkl is an SMPL model; .npz one too if it has `v_template`, otherwise poses; anything
             else is a mesh, which must be closed.
+        name: what a scene is called; the file's name without its suffix if None.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -46,27 +52,50 @@ def open_file(path: Path) -> Scene | PoseFile:
     if not path.exists():
         raise FileNotFoundError(f"file must exist: got {str(path)!r}; check the spelling")
     if path.suffix == ".pkl" or _is_model(path):
-        return Scene.of_body(load_body(path), path.stem)
+        return Scene.of_body(load_body(path), name or path.stem)
     if path.suffix.lower() == ".npz":
         return read_poses(path)
     vertices, faces = read_mesh(path)
     check_mesh(vertices, faces).raise_if_unfit()
-    return Scene.of_mesh(vertices, faces, path.stem)
+    return Scene.of_mesh(vertices, faces, name or path.stem)
 
 
 def open_upload(name: str, content: bytes) -> Scene | PoseFile:
     """The same for a file that a browser sent; nothing of it stays on the disk.
 
+    On the disk it has a name of our own: of the one that it came with, the suffix says which reader
+    takes it, and the rest is shown, never looked up.
+
     Raises:
         ValueError: as `open_file`; the message says the file's name, not where it lay meanwhile.
     """
+    label = label_of(name)
+    title, suffix = PurePosixPath(label).stem, PurePosixPath(label).suffix.lower()
+    own = secrets.token_hex(8)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / (Path(name.replace("\\", "/")).name or "file")
+        path = Path(folder) / (own + (suffix if _SUFFIX.fullmatch(suffix) else ""))
         path.write_bytes(content)
         try:
-            return open_file(path)
+            opened = open_file(path, title)
         except (OSError, TypeError, ValueError) as error:
-            raise ValueError(str(error).replace(str(path), path.name)) from error
+            message = str(error).replace(str(path), label).replace(path.name, label)
+            raise ValueError(message.replace(own, title)) from error
+    if isinstance(opened, PoseFile):  # frames without names are called after their file
+        opened = opened._replace(names=[frame.replace(own, title) for frame in opened.names])
+    return opened
+
+
+def label_of(name: str) -> str:
+    """A file's name as it can be shown: one printable line, without folders.
+
+    Example:
+        >>> from spt_jax.view.files import label_of
+        >>> label_of("..\\\\folder/walk.npz"), label_of("a\\nb.ply"), label_of("/")
+        ('walk.npz', 'a b.ply', 'file')
+    """
+    last = name.replace("\\", "/").rstrip("/").rpartition("/")[2]
+    label = "".join(letter if letter.isprintable() else " " for letter in last).strip()
+    return label[-_LONGEST_NAME:] if label.strip(".") else "file"
 
 
 def frames_for(given: PoseFile, body: BodyModel, *, embedded: bool) -> tuple[Frames, list[str]]:

@@ -166,7 +166,8 @@ class Panel:
     def _file_widgets(self) -> None:
         with self._gui.add_folder("Files"):
             hint = "Poses (.npz), a mesh (.ply, .obj, .stl, .off, .glb), an SMPL model (.npz, .pkl)"
-            upload = self._gui.add_upload_button("Open a file", hint=hint)
+            # What comes of it goes to the view's own `Uploads`.
+            self._gui.add_upload_button("Open a file", hint=hint)
             if self._scene.body is None:
                 embedded = self._gui.add_button("Embedded body", color="gray")
                 self._on(embedded, "open", "open_embedded", click=True, value=False)
@@ -175,11 +176,6 @@ class Panel:
             if self._scene.body is not None:
                 save_pose = self._gui.add_button("Save pose", color="gray")
                 self._on(save_pose, "save_pose", "save_pose", click=True, value=False, client=True)
-
-        async def on_upload(event: Any) -> None:
-            self._do("open", "open_upload", event.target.value.name, event.target.value.content)
-
-        upload.on_upload(on_upload)
 
     def _on(
         self,

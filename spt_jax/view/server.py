@@ -1,7 +1,5 @@
 """The live view: viser's server, its panel and stage, and the worker that serves them."""
 
-import contextlib
-import socket
 import sys
 import threading
 import traceback
@@ -15,10 +13,13 @@ from spt_jax.body import load_body
 from spt_jax.body.pose_files import PoseFile
 from spt_jax.mesh_check import check_mesh
 from spt_jax.view import files
+from spt_jax.view.access import access_for, free_port
 from spt_jax.view.freeing import untangle_scene
+from spt_jax.view.guarded import PATIENCE, start_guarded, stop_quietly
 from spt_jax.view.panel import MEASURES, Panel
 from spt_jax.view.scene import Reading, Scene
 from spt_jax.view.stage import Stage
+from spt_jax.view.uploads import UPLOAD_LIMIT, Uploads
 from spt_jax.view.worker import Worker
 
 # A fist in the belly: something to set free at first sight.
@@ -34,26 +35,36 @@ _EDITS = frozenset(
 class View:
     """A scene in the browser.
 
-    Methods whose names do not start with an underscore, `start`, `stop_serving` and `url` aside,
-    are what the panel asks for; they run on the worker's thread.
+    Methods whose names do not start with an underscore, `start`, `stop_serving` and the addresses
+    aside, are what the panel asks for; they run on the worker's thread.
 
     Args:
         file: poses, a mesh or an SMPL model to begin with; the embedded body if None.
-        host: address to serve on; anybody who can reach it can use the view.
+        host: address to serve on; who can reach it still needs the token of `url`.
         port: the next free one is taken where it is in use.
+        upload_limit: of a file that a browser sends, in megabytes.
+        patience: seconds after which a browser that does not answer is let go.
 
     Raises:
-        ImportError: viser is not installed.
+        ImportError: viser is not installed, or is one that cannot be guarded.
         OSError, ValueError: the file cannot be read, holds nothing that could be measured, or the
             host is no address of this machine; nothing is served then.
     """
 
-    def __init__(self, file: Path | None = None, *, host: str = "127.0.0.1", port: int = 8080):
+    def __init__(
+        self,
+        file: Path | None = None,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        upload_limit: int = UPLOAD_LIMIT,
+        patience: float = PATIENCE,
+    ):
         viser = import_viser()
-        _check_host(host)
+        self.access, numeric = access_for(host)
         opened = None if file is None else files.open_file(file)
-        with contextlib.redirect_stdout(None):  # its banner; the command says where it serves
-            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        port = free_port(numeric, port)
+        self.server = start_guarded(viser, self.access, numeric, port, patience)
         self._stop = threading.Event()
         self._untangling = False
         self._notes: list[str] = []
@@ -63,19 +74,23 @@ class View:
         self._embedded = True
         self.worker = Worker(self._refresh, self._report)
         try:
-            self._take(opened if opened is not None else _embedded_body(), file, first=True)
+            name = None if file is None else file.name
+            self._take(opened if opened is not None else _embedded_body(), name, first=True)
         except Exception:
-            with contextlib.redirect_stdout(None):
-                self.server.stop()
+            stop_quietly(self.server)
             raise
+        Uploads(self.server, upload_limit, self._take_upload)
         self.server.on_client_connect(self._say_notes)
 
     @property
     def url(self) -> str:
-        """Where the view is served."""
-        host = self.server.get_host()
-        name = {"0.0.0.0": "localhost"}.get(host, f"[{host}]" if ":" in host else host)
-        return f"http://{name}:{self.server.get_port()}"
+        """The address that opens the view, with its token."""
+        return self.access.url(self.server.get_port())
+
+    @property
+    def url_elsewhere(self) -> str:
+        """The same for another machine, where it can reach this one."""
+        return self.access.url_elsewhere(self.server.get_port())
 
     def start(self) -> None:
         """Begin to work."""
@@ -86,8 +101,7 @@ class View:
         """End the server; whether the work under way ended too."""
         self._stop.set()
         ended = self.worker.stop(timeout)
-        with contextlib.redirect_stdout(None):
-            self.server.stop()
+        stop_quietly(self.server)
         return ended
 
     # What the panel asks for.
@@ -167,7 +181,7 @@ class View:
 
     def open_upload(self, name: str, content: bytes) -> None:
         """Show a file that a browser sent; a bad one changes nothing."""
-        self._take(files.open_upload(name, content), Path(name), first=False)
+        self._take(files.open_upload(name, content), files.label_of(name), first=False)
 
     def open_embedded(self) -> None:
         """Show the body that comes with the package."""
@@ -195,18 +209,21 @@ class View:
     def _turned(self, joint: int, wxyz: tuple[float, ...]) -> None:
         self._do(("handle", joint), "turn_in_world", joint, wxyz)
 
-    def _take(self, opened: Scene | PoseFile, file: Path | None, *, first: bool) -> None:
+    def _take_upload(self, name: str, content: bytes) -> None:
+        self._do("open", "open_upload", name, content)
+
+    def _take(self, opened: Scene | PoseFile, name: str | None, *, first: bool) -> None:
         notes: Sequence[str] = ()
         if isinstance(opened, PoseFile):
             scene = self.scene if not first else _embedded_body()
             if scene.body is None:
                 scene, self._embedded = _embedded_body(), True
-            name = Path(file or "poses").name
+            name = name or "poses"
             frames, notes = files.frames_for(opened, scene.body, embedded=self._embedded)  # type: ignore
             motions, start = {name: frames, **files.mocap_for(scene.body)}, (name, 0)  # type: ignore
         else:
             scene = opened
-            self._embedded = file is None
+            self._embedded = name is None
             motions = {} if scene.body is None else files.mocap_for(scene.body)
             if scene.body is not None and not self._embedded:
                 notes = check_mesh(np.asarray(scene.body.template), scene.faces).problems
@@ -267,18 +284,6 @@ def import_viser() -> Any:
             f'the live view needs viser: got "{error}"; run: pip install "spt_jax[view]"'
         ) from error
     return viser
-
-
-def _check_host(host: str) -> None:
-    # viser 1.1 tries in a thread, and waits for ever where that fails.
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, socket.SOCK_STREAM) as trial:
-            trial.bind(address)
-    except OSError as error:
-        raise ValueError(
-            f"host must be an address of this machine, such as 127.0.0.1: got {host!r} ({error})."
-        ) from error
 
 
 def _embedded_body() -> Scene:
