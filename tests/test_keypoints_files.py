@@ -197,9 +197,9 @@ def _body25(value, index=30):
 
 _V = [10, 20, 2] * 17
 _BAD = [
-    ("", "must be JSON: got Expecting value at line 1, column 1; it is cut or damaged"),
+    ("", "must be JSON: got .* with Expecting value at line 1, column 1; it is cut or damaged"),
     ('{"people": [{"pose_keypoints_2d": [1, 2', "must be JSON: got .* it is cut"),
-    ("[" * 100_000, "must be JSON"),
+    ("[" * 100_000, "must not be nested so deeply"),
     ("3", "must hold COCO annotations .* got int"),
     ('"people"', "got str"),
     ({"frames": []}, r"must hold COCO annotations .* got \['frames'\]"),
@@ -224,7 +224,7 @@ _BAD = [
     (_own(_changed(3, 2, float("inf"))), "confidence of keypoint 3 .* must be finite: got inf"),
     (_own(_changed(3, 1, 10**400)), "y of keypoint 3 .* must be finite"),
     (_own(_changed(3, 1, -3e8)), "y of keypoint 3 .* at most 1e.06 in size: got -300000000.0"),
-    (_own(_changed(3, 2, 400)), "confidence of keypoint 3 .* at most 100"),
+    (_own(_changed(3, 2, 400)), "confidence of keypoint 3 .* at most 20 .* divide percent"),
     (_own(_changed(3, 2, -0.1)), "confidence of keypoint 3 .* must not be negative: got -0.1"),
     (_own(_GOOD, width="wide"), "width in .* must be a number: got 'wide'"),
     (_own(_GOOD, height=0), "height in .* must be a number of pixels"),
@@ -267,14 +267,14 @@ def test_a_bad_file_says_what_is_wrong_with_it(tmp_path, content, message):
 def test_bad_archives_and_paths_are_named(tmp_path):
     path = tmp_path / "broken.npz"
     path.write_bytes(b"no archive")
-    with pytest.raises(ValueError, match=r"broken\.npz must be an \.npz archive"):
+    with pytest.raises(ValueError, match=r"must be an \.npz archive: got .*broken\.npz"):
         read_keypoints(path)
     points = np.zeros((17, 2))
     for arrays, message in [
         ({"joints": points}, "must hold keypoints, .* got joints"),
         ({"keypoints": np.zeros(17)}, r"must have shape .* got \(17,\)"),
         ({"keypoints": np.array([["a", "b"]])}, "must be real numbers: got dtype <U1"),
-        ({"keypoints": np.array([[None, 1]])}, "must be an .npz file of numbers: got Object"),
+        ({"keypoints": np.array([[None, 1]])}, "is an object array"),
         ({"keypoints": points, "confidence": np.ones(16)}, "one number a keypoint"),
         ({"keypoints": points, "layout": 3}, "layout in .* must be a name: got 3"),
         ({"keypoints": points}, "needs a layout"),
@@ -286,11 +286,11 @@ def test_bad_archives_and_paths_are_named(tmp_path):
         assert "broken.npz" in str(caught.value)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=r"broken\.npz must be an \.npz"):
+    with pytest.raises(ValueError, match=r"must be an \.npz archive: got .*broken\.npz"):
         read_keypoints(path)
     with pytest.raises(FileNotFoundError, match="check the spelling"):
         read_keypoints(tmp_path / "none.json")
-    with pytest.raises(ValueError, match="a folder"):
+    with pytest.raises(ValueError, match="got the folder"):
         read_keypoints(tmp_path)
     (tmp_path / "binary.json").write_bytes(b"\x80\x04\x95\xff")
     with pytest.raises(ValueError, match="bytes that are no text at position 0"):

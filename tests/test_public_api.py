@@ -57,7 +57,7 @@ PARAMETERS = {
     "fit_people": "body, keypoints, camera, *, joints, weights=(0.01, 0.1, 1.0, 10.0, 100.0),"
     " margin=0.002, fold_distance=None, max_steps=25, **options",
     "keypoint_regressor": "body, joints, *, count=None, names=None",
-    "read_keypoints": "path, *, layout=None",
+    "read_keypoints": "path, *, layout=None, max_bytes=None",
     "load_body": "source='anny', *, num_shape=10, dtype=None",
     "load_mocap": "",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"

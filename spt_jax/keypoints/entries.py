@@ -1,10 +1,12 @@
 """One person's numbers in a file of keypoints, checked one by one."""
 
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from .confidences import shown
 from .layouts import LAYOUTS, Layout, as_layout
 
 #: Confidence of a point that COCO's annotators marked as hidden (v = 1): they guessed its place.
@@ -12,8 +14,13 @@ OCCLUDED = 0.5
 
 # No camera has a million pixels in a row: such a number is another column, or damage.
 _FARTHEST = 1e6
-# Some detectors give scores above 1, but not such; it is another column.
-_SUREST = 100.0
+# AlphaPose gives up to 6, and the logits of MMPose's SimCC heads reach 10
+# (https://github.com/open-mmlab/mmpose/issues/2939). Percent would all become 1.
+_SUREST = 20.0
+# Layouts that begin with COCO's 17 points: feet; Halpe's head, neck, hip and feet; both again with
+# face and hands (COCO-WholeBody, Halpe's full body).
+_LONGER_THAN_COCO = (23, 26, 133, 136)
+_CLIPPED = "confidences above 1, taken as 1"
 _COLUMNS = ("x", "y", "confidence")
 
 
@@ -40,54 +47,37 @@ class Person(NamedTuple):
     score: float | None = None
 
 
-def as_rows(where: str, values: Any) -> list[Any]:
-    """The numbers of [x, y, c, x, y, c, ...], [[x, y, c], ...] or [[x, y], ...], as one flat list.
-
-    Raises:
-        ValueError: it is no such list; `where` names the file and the person.
-    """
-    if isinstance(values, np.ndarray):
-        values = values.tolist()
-    if not isinstance(values, list) or not values:
-        raise ValueError(
-            f"{where} must be a list of x, y and confidence: got {_shown(values)}; leave out a "
-            "person without keypoints."
-        )
-    if not any(isinstance(row, list) for row in values):
-        if len(values) % 3:
-            raise ValueError(
-                f"{where} must have three numbers a keypoint, x, y and confidence: got "
-                f"{len(values)} numbers; the list is cut or of another kind."
-            )
-        return values
-    flat = []
-    for k, row in enumerate(values):
-        if not isinstance(row, list) or len(row) not in (2, 3) or len(row) != len(values[0]):
-            raise ValueError(
-                f"{where} must have rows [x, y, confidence], or all [x, y]: got {_shown(row)} for "
-                f"keypoint {k}."
-            )
-        flat += [*row, 1.0] if len(row) == 2 else row
-    return flat
-
-
 def choose_layout(
-    where: str, flat: list[Any], wanted: str | None, usual: tuple[str, ...]
-) -> Layout:
+    where: str,
+    flat: list[Any],
+    wanted: str | None,
+    usual: tuple[str, ...],
+    remarks: Counter[str],
+) -> tuple[Layout, list[Any]]:
     """The layout asked for, or the one of the format's own that has so many keypoints.
+
+    Returns:
+        The layout, and the numbers of its points: of a longer list that begins with COCO's 17,
+        these, and what is left out is counted in `remarks`.
 
     Raises:
         ValueError: it has another count, or the format has none of that count.
     """
     count = len(flat) // 3
+    if count in _LONGER_THAN_COCO and (wanted == "coco17" or (not wanted and "coco17" in usual)):
+        kept = len(LAYOUTS["coco17"].names)
+        remarks["points of feet, face, hands and such after COCO's 17, which are not used"] += (
+            count - kept
+        )
+        return LAYOUTS["coco17"], flat[: 3 * kept]
     if wanted is not None:
         try:
-            return as_layout(wanted, count)
+            return as_layout(wanted, count), flat
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from error
     for name in usual:
         if len(LAYOUTS[name].names) == count:
-            return LAYOUTS[name]
+            return LAYOUTS[name], flat
     counts = " or ".join(f"{len(LAYOUTS[name].names)} ({name})" for name in usual)
     rule = f"must have {counts} keypoints" if usual else "needs a layout, which the file lacks"
     raise ValueError(
@@ -96,7 +86,12 @@ def choose_layout(
 
 
 def as_points(
-    where: str, flat: list[Any], layout: Layout, *, flags: bool = False
+    where: str,
+    flat: list[Any],
+    layout: Layout,
+    remarks: Counter[str],
+    *,
+    flags: bool = False,
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K"]]:
     """Points and confidences of checked numbers.
 
@@ -104,11 +99,13 @@ def as_points(
         where: names the file and the person, for errors.
         flat: x, y and confidence of each keypoint in turn.
         layout: names the keypoints, for errors.
+        remarks: of what is changed, which are counted up.
         flags: the third number is COCO's v: 0 not labelled, 1 labelled but hidden, 2 visible.
 
     Returns:
-        Pixels, (0, 0) where missing, and confidences from 0 to 1; larger ones, which some detectors
-        give, become 1.
+        Points, (0, 0) where missing, and confidences from 0 to 1; larger ones, which some detectors
+        give, become 1. A point at (0, 0) is missing whatever its confidence: so detectors mark
+        those that they did not find.
 
     Raises:
         ValueError: an entry is no number, is not finite, is out of range; a v that is none.
@@ -120,7 +117,10 @@ def as_points(
         numbers[index] = as_number(f"{where}: {entry}", value)
         limit = _SUREST if column == 2 else _FARTHEST
         if abs(numbers[index]) > limit:
-            raise ValueError(f"{where}: {entry} must be at most {limit:g} in size: got {value!r}.")
+            hint = "; divide percent by 100" if column == 2 else ""
+            raise ValueError(
+                f"{where}: {entry} must be at most {limit:g} in size: got {value!r}{hint}."
+            )
         if column < 2:
             continue
         if flags and value not in (0, 1, 2):
@@ -131,7 +131,12 @@ def as_points(
             )
     rows = numbers.reshape(-1, 3)
     confidence = np.array([0, OCCLUDED, 1])[rows[:, 2].astype(int)] if flags else rows[:, 2]
-    confidence = np.minimum(confidence, 1.0)
+    lost = (confidence > 0) & ~rows[:, :2].any(axis=1)
+    over = (confidence > 1) & ~lost
+    for what, found in (("points at (0, 0), taken as missing", lost), (_CLIPPED, over)):
+        if found.any():
+            remarks[what] += int(found.sum())
+    confidence = np.where(lost, 0.0, np.minimum(confidence, 1.0))
     return np.where(confidence[:, None] > 0, rows[:, :2], 0.0), confidence
 
 
@@ -142,7 +147,7 @@ def as_number(where: str, value: Any) -> float:
         ValueError: it is none; `where` names the entry.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{where} must be a number: got {_shown(value)}.")
+        raise ValueError(f"{where} must be a number: got {shown(value)}.")
     try:
         number = float(value)
     except OverflowError:
@@ -171,8 +176,3 @@ def as_size(where: str, value: Any) -> int | None:
 def as_label(value: Any) -> str | int | None:
     """A name or an id; anything else is no label."""
     return value if isinstance(value, (str, int)) and not isinstance(value, bool) else None
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
