@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 import trimesh
-from helpers_body import PARENTS, slow_rotation
+from helpers_body import PARENTS, ball_arrays, slow_rotation
 
 from spt_jax import cli, intersection_report, load_body, untangle_mesh, untangle_pose
 from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
@@ -20,33 +20,6 @@ from spt_jax.view.scene import Scene, body_parts
 from spt_jax.view.worker import Worker
 
 _ELBOW = SMPL_LAYOUTS[24].index("left_elbow")
-
-
-def ball_arrays():
-    """An SMPL file's arrays: a ball for each joint of a stick figure, all of them apart."""
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
-    names, parents = SMPL_LAYOUTS[24], PARENTS[24]
-    joints = np.zeros((24, 3))
-    for joint, parent in enumerate(parents[1:], start=1):
-        name = names[joint]
-        side = 1.0 if name.startswith("left") else -1.0 if name.startswith("right") else 0.0
-        across = any(part in name for part in ("collar", "shoulder", "elbow", "wrist", "hand"))
-        hip = name.endswith("hip")
-        up = -0.2 if any(part in name for part in ("knee", "ankle", "foot")) else 0.2
-        step = (0.2 * side, 0.0, 0.0) if across or hip else (0.0, up, 0.0)
-        joints[joint] = joints[parent] + step
-    count = len(ball.vertices)
-    owner = np.repeat(np.arange(24), count)
-    vertices = (joints[:, None] + ball.vertices).reshape(-1, 3)
-    faces = (np.arange(24)[:, None, None] * count + ball.faces).reshape(-1, 3)
-    return {
-        "v_template": vertices,
-        "shapedirs": np.ones((len(vertices), 3, 2)) * [0.01, 0.02],
-        "J_regressor": (owner == np.arange(24)[:, None]) / count,
-        "weights": np.eye(24)[owner],
-        "kintree_table": np.array([parents, range(24)]).astype(np.uint32),
-        "f": faces.astype(np.uint32),
-    }
 
 
 @pytest.fixture(scope="module")

@@ -34,14 +34,13 @@ def view(
     if upload_limit < 1:
         raise CommandError(f"upload_limit must be at least 1 MB: got {upload_limit}.")
     show(err_console(quiet), "loading the body")
-    from spt_jax.view.server import View, import_viser
+    from spt_jax.view.server import View
 
     try:
-        import_viser()
+        with user_errors():
+            served = View(file, host=host, port=port, upload_limit=upload_limit)
     except ImportError as error:
         raise CommandError(" ".join(str(error).split())) from error
-    with user_errors():
-        served = View(file, host=host, port=port, upload_limit=upload_limit)
     served.start()
     # Always: nobody gets in without the token.
     show(out_console(), f"open {served.url} in a browser; Ctrl-C ends it")

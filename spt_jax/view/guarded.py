@@ -13,9 +13,8 @@ from spt_jax.view.access import Access
 
 # Of one message from a browser; viser's page sends files in parts of half a MiB.
 _LARGEST_MESSAGE = 1 << 20
-# A browser that does not answer for so long is taken to be gone: `websockets` asks it as often.
 PATIENCE = 20.0
-"""Seconds."""
+"""Seconds: a browser is asked as often, and let go when it has not answered for so long."""
 _HEADERS = {
     "Cache-Control": "no-store",  # the address has the token
     "Content-Security-Policy": "frame-ancestors 'none'",
@@ -42,7 +41,7 @@ def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience:
         access: who is let in.
         numeric: the address to serve on, as a number.
         port: the port.
-        patience: seconds after which a browser that does not answer is let go.
+        patience: seconds between two questions to a browser, for its answer, and for its farewell.
 
     Raises:
         ImportError: this version of viser cannot be guarded.
@@ -59,14 +58,12 @@ def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience:
         options["process_request"] = _guard(access, options.get("process_request"))
         options["process_response"] = _harden
         options["max_size"] = _LARGEST_MESSAGE
-        options["ping_interval"] = options["ping_timeout"] = patience
+        options["ping_interval"] = options["ping_timeout"] = options["close_timeout"] = patience
         options["logger"] = _LOGGER
         return plain(_tolerant(handler), *arguments, **options)
 
-    with (
-        _STARTING,
-        contextlib.redirect_stdout(None),
-    ):  # its banner; the command says where it serves
+    # Without viser's banner: the command says where it serves.
+    with _STARTING, contextlib.redirect_stdout(None):
         sockets.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
         try:
             server = viser.ViserServer(host=numeric, port=port, verbose=False)

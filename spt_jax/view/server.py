@@ -43,7 +43,7 @@ class View:
         host: address to serve on; who can reach it still needs the token of `url`.
         port: the next free one is taken where it is in use.
         upload_limit: of a file that a browser sends, in megabytes.
-        patience: seconds after which a browser that does not answer is let go.
+        patience: seconds that a browser has for an answer; one that gives none is let go.
 
     Raises:
         ImportError: viser is not installed, or is one that cannot be guarded.
