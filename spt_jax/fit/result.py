@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.body import BodyModel
+from spt_jax.fit import photograph
 from spt_jax.fit.objective import Objective
 
 _REASONS = (
@@ -15,6 +16,7 @@ _REASONS = (
     "stopped at the largest number of steps",
     "not finite: keypoints or camera are unusable",
     "no keypoint was seen: this is where the fit started",
+    *(photograph.REASONS[code] for code in sorted(photograph.REASONS)),
 )
 
 
@@ -32,7 +34,8 @@ class FitResult(eqx.Module):
             "upright" and the regulariser's name, weighted, those that were used; their sum is
             "total". `fit_pose` says what they are.
         status: 0 converged; 1 stopped at the largest number of steps; 2 not finite; 3 no keypoint
-            was seen. `reason` says it in words.
+            was seen; 4, 5 and 6: distance, size or focal length lie outside any photograph, so that
+            camera or keypoints are in other units than pixels. `reason` says it in words.
     """
 
     pose: Float[Array, "*batch J 3"]
@@ -47,7 +50,7 @@ class FitResult(eqx.Module):
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the last stage ended at a minimum."""
+        """Whether the last stage ended at a minimum that a photograph could show."""
         return self.status == 0
 
     @property
@@ -82,7 +85,8 @@ def fit_result(
     terms |= regularised
     terms["total"] = sum(terms.values(), jnp.zeros((), vector.dtype))
     finite = jnp.all(jnp.isfinite(posed.vertices)) & jnp.isfinite(terms["total"])
-    status = jnp.where(converged, 0, 1)
+    outside = photograph.outside_photographs(objective, vector, posed.vertices)
+    status = jnp.where(outside == 0, jnp.where(converged, 0, 1), outside)
     status = jnp.where(finite, status, 2)
     status = jnp.where(jnp.any(objective.confidence > 0), status, 3)
     return FitResult(
