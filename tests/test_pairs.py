@@ -240,6 +240,32 @@ def test_small_parts_give_what_large_ones_do(rng, monkeypatch):
     assert found_in(mesh) == expected != set()
 
 
+@pytest.mark.parametrize("spokes", [20, 400])
+def test_triangles_that_share_a_vertex_are_known_from_the_faces(spokes, rng):
+    # A pole of 400 triangles belongs to more clusters than are kept; its pairs are left open.
+    angle = np.linspace(0, 2 * np.pi, spokes, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle), rng.normal(size=spokes)], axis=1)
+    here, there = np.arange(spokes), np.roll(np.arange(spokes), -1)
+    poles = np.repeat([spokes, spokes + 1], spokes)
+    faces = np.stack([np.tile(here, 2), np.tile(there, 2), poles], axis=1)
+    vertices = np.concatenate([rim, [[0, 0, 5], [0, 0, -5]]])
+    layout = prepared(faces, len(vertices)).arrange(pair_boxes._face_boxes(vertices.T, faces))
+    sharing, size = layout.sharing, pair_layout.CLUSTER
+    first, second = (x.ravel() for x in np.triu_indices(len(layout.face), 1))
+    filled = np.ones(len(layout.face), bool)
+    filled[layout.empty] = False
+    kept = filled[first] & filled[second] & (first // size != second // size)
+    first, second = first[kept], second[kept]
+    groups = sharing.rows_of(first // size**2, second // size**2)
+    row = sharing.row[groups, first // size % size * size + second // size % size]
+    apart = sharing.apart[row, first % size, second % size]
+    p, q = layout.corners[:, first], layout.corners[:, second]
+    share = (p[:, None] == q[None]).any(axis=(0, 1))
+    assert (share & apart).any() == (spokes == 400)
+    assert (apart | share).all()
+    assert share[~apart].sum() > spokes
+
+
 def test_large_triangles_beside_small_ones():
     small = moved(sphere(0.1, subdivisions=4), np.eye(3), (0.48, 0.03, 0.02))
     mesh = join(box((100.0, 1.0, 1.0), (-49.5, 0.0, 0.0)), small)

@@ -101,15 +101,14 @@ def shares_of(
     corners = faces[found]
     normals = area_normals(vertices, corners)
     sums = _sides(topology, crossings, ends, layer, found, row, times)
-    for own, sign in ((0, 1.0), (1, -1.0)):
-        at = row[contours.pair[:, own]]
-        start, end = (
-            _coordinates(vertices, topology, crossings, contours, own, k, corners[at], normals[at])
-            for k in (0, 1)
-        )
-        steps = sign * _along(start, end)
+    if len(contours.pair):
+        # Once along the first triangle of each pair, and once the other way along the second.
+        at = row[contours.pair.T.ravel()]
+        start, end = _coordinates(vertices, topology, crossings, contours, corners[at], normals[at])
+        steps = _along(start, end)
+        steps[len(contours.pair) :] *= -1.0
         if times is not None:
-            steps *= times[contours.pair[:, 1 - own], None]
+            steps *= times[contours.pair[:, ::-1].T.ravel(), None]
         sums += summed(at, steps, len(found))
     sound = np.abs(sums[:, 3:]).max(axis=1, initial=0.0) < _GAP
     sound[row[contours.pair[~contours.whole]]] = False
@@ -119,23 +118,30 @@ def shares_of(
     return Shares(found, normals, share, sound)
 
 
-def _coordinates(vertices, topology, crossings, contours: Contours, own, k, corners, normals):
-    """(u, v), on the first or second triangle of each pair, of the segments' starts or ends."""
-    a, b, c = (vertices[corners[:, j]] for j in range(3))
-    point = contours.point[:, k]
-    square = np.maximum(dot(normals, normals), np.finfo(float).tiny)
-    u = np.clip(dot(normals, cross(point - a, c - a)) / square, 0.0, 1.0)
-    v = np.clip(dot(normals, cross(b - a, point - a)) / square, 0.0, 1.0)
-    over = np.maximum(u + v, 1.0)
-    found = np.stack([u / over, v / over], axis=1)
-    # On its own side a place is known by the part of the edge, whatever the triangle's shape.
-    number = contours.end[:, k]
-    mine = np.flatnonzero((number >= 0) & (contours.owner[:, k] == own))
-    half = contours.half[mine, k]
-    found[mine] = _on_sides(topology, half, crossings.part[number[mine]])
-    cusp = np.flatnonzero(number < 0)
-    turn = np.argmax(corners[cusp] == contours.cusp[cusp, None], axis=1)
-    found[cusp] = _CORNERS[turn]
+def _coordinates(vertices, topology, crossings, contours: Contours, corners, normals):
+    """(u, v) of the segments' starts and ends, on the first triangles and then on the second ones.
+
+    Args:
+        corners, normals: of the first triangles of all pairs, then of the second ones.
+    """
+    a, b, c = (vertices[corner] for corner in corners.T)
+    square = np.maximum(dot(normals, normals), np.finfo(float).tiny)[:, None]
+    across_u, across_v = cross(c - a, normals) / square, cross(normals, b - a) / square
+    cusp = np.tile(contours.cusp, 2)[:, None]
+    found = np.empty((2, len(corners), 2))
+    for k, at in enumerate(found):
+        arm = np.tile(contours.point[:, k], (2, 1)) - a
+        u = np.clip(dot(across_u, arm), 0.0, 1.0)
+        v = np.clip(dot(across_v, arm), 0.0, 1.0)
+        over = np.maximum(u + v, 1.0)
+        at[:, 0], at[:, 1] = u / over, v / over
+        # On its own side a place is known by the part of the edge, whatever the triangle's shape.
+        number, owner = contours.end[:, k], contours.owner[:, k]
+        passing = np.flatnonzero(number >= 0)
+        mine = passing + owner[passing] * len(number)
+        at[mine] = _on_sides(topology, contours.half[passing, k], crossings.part[number[passing]])
+        ending = np.flatnonzero(np.tile(number < 0, 2))
+        at[ending] = _CORNERS[np.argmax(corners[ending] == cusp[ending], axis=1)]
     return found
 
 

@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 
-# Candidates handled at once: bounds the memory for any mesh. The posed body takes 21 ms with 2^14
-# of them, 17 with 2^16 and 2^17; five bodies 148, 103 and 99.
-_CHUNK = 1 << 17
+# Candidates handled at once: bounds the memory for any mesh. A posed body's pairs take 5.0 ms with
+# this many, 5.5 with 50,000 and 9 with 2^14; with 2^17, whose arrays of 1 MiB the allocator may
+# give back to the system each time, up to 9.8.
+_CHUNK = 96 << 10
 # A coordinate of a box takes 20 bits and a guard bit, three to a word: two subtractions of words
 # do the six comparisons of two boxes, and a pair gathers four numbers instead of twelve.
 _FIELD = 21
@@ -120,18 +121,18 @@ def near_pairs(layout: Layout, shape: Shape, clusters: _Boxes, groups: _Pairs, t
 
 
 def _all_near_pairs(layout: Layout, shape: Shape, clusters: _Boxes, groups: _Pairs, marked):
-    for part in parts(np.ones(layout.apart.shape[1], np.int64)):
+    for part in pieces(layout.apart.shape[1], 1):
         yield _kept_meeting(shape, *layout.apart[:, part])
     for a, b in groups:
-        for c, d in _meeting_members(clusters.low_word, clusters.high_word, a, b):
+        for c, d, row in _meeting_members(layout, clusters, a, b):
             if marked is not None:
                 kept = marked[c] | marked[d]
-                c, d = c[kept], d[kept]
-            yield from _meeting_triangles(layout, shape, clusters, c, d)
+                c, d, row = c[kept], d[kept], row[kept]
+            yield from _meeting_triangles(layout, shape, clusters, c, d, row)
 
 
 def _meeting_boxes(boxes: _Boxes):
-    """Pairs of boxes that meet, each with itself too, in parts of bounded size."""
+    """Pairs of boxes that meet, the lower first, each with itself too, in parts of bounded size."""
     axis = int(np.argmax(np.ptp(boxes.low, axis=1)))
     order = np.argsort(boxes.low[axis])
     first = boxes.low[axis][order]
@@ -143,13 +144,19 @@ def _meeting_boxes(boxes: _Boxes):
         b, at = spread(here[part], count[part])
         a = at + part.start
         kept = np.flatnonzero(_meet(low.take(a), high.take(a), low.take(b), high.take(b)))
-        yield order[a[kept]], order[b[kept]]
+        a, b = order[a[kept]], order[b[kept]]
+        yield np.minimum(a, b), np.maximum(a, b)
 
 
-def _meeting_members(low, high, a, b):
-    """Pairs of the members of a and b that meet, a before b where these are the same."""
-    low, high = low.reshape(-1, CLUSTER), high.reshape(-1, CLUSTER)
-    for part in parts(np.full(len(a), CLUSTER * CLUSTER)):
+def _meeting_members(layout: Layout, clusters: _Boxes, a, b):
+    """Pairs of clusters of the groups a and b that meet, a before b where these are the same.
+
+    Yields:
+        The clusters, and the row of each pair in the layout's `sharing.apart`.
+    """
+    low, high = (word.reshape(-1, CLUSTER) for word in (clusters.low_word, clusters.high_word))
+    rows = layout.sharing.rows_of(a, b)
+    for part in pieces(len(a), CLUSTER * CLUSTER):
         p, q = a[part], b[part]
         meet = _meet(
             low.take(p, axis=0)[:, :, None],
@@ -159,23 +166,26 @@ def _meeting_members(low, high, a, b):
         )
         meet[p == q] &= _BEFORE
         found = np.flatnonzero(meet)
-        pair = found // CLUSTER**2
+        pair, place = found // CLUSTER**2, found % CLUSTER**2
+        row = layout.sharing.row.take(rows[part].take(pair) * CLUSTER**2 + place)
         p, q = CLUSTER * p.take(pair), CLUSTER * q.take(pair)
-        yield p + found // CLUSTER % CLUSTER, q + found % CLUSTER
+        yield p + place // CLUSTER, q + place % CLUSTER, row
 
 
-def _meeting_triangles(layout: Layout, shape: Shape, boxes: _Boxes, a, b):
+def _meeting_triangles(layout: Layout, shape: Shape, boxes: _Boxes, a, b, row):
     """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
     low, high = (word.reshape(-1, CLUSTER) for word in (shape.low_word, shape.high_word))
-    for part in parts(np.full(len(a), 3 * CLUSTER)):
+    masks = layout.sharing.apart.reshape(-1, CLUSTER)
+    for part in pieces(len(a), 3 * CLUSTER):
         pair, t = _reaching(shape, boxes, a[part], b[part])
         # Against all of the other cluster at once: only those that reach back are fewer, but to
         # look each of them up takes a third longer.
-        other = b[part].take(pair)
-        for piece in parts(np.full(len(t), CLUSTER)):
+        other, mask = b[part].take(pair), row[part].take(pair) * CLUSTER + t % CLUSTER
+        for piece in pieces(len(t), CLUSTER):
             u, first = other[piece], t[piece]
             low_t, high_t = shape.low_word.take(first), shape.high_word.take(first)
             meet = _meet(low_t[:, None], high_t[:, None], low.take(u, axis=0), high.take(u, axis=0))
+            meet &= masks.take(mask[piece], axis=0)
             found = np.flatnonzero(meet)
             at = found // CLUSTER
             second = CLUSTER * u.take(at) + found % CLUSTER
@@ -249,6 +259,13 @@ def spread(first, count):
     """first[i], first[i] + 1, ... (count[i] of them) for each i in turn; and the i of each."""
     at = np.repeat(np.arange(len(count)), count)
     return np.arange(len(at)) + (first - np.cumsum(count) + count).take(at), at
+
+
+def pieces(count: int, size: int) -> Iterator[slice]:
+    """Slices of `count` items, each of which counts `size` times, of about `_CHUNK` in all."""
+    step = max(_CHUNK // size, 1)
+    for begin in range(0, count, step):
+        yield slice(begin, min(begin + step, count))
 
 
 def parts(count) -> Iterator[slice]:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.triangles.faces_cache import FacesCache
 from spt_jax.overlap.triangles.manifold import matched_half_edges
+from spt_jax.overlap.triangles.pair_sharing import Sharing, sharing
 
 # Triangles to a cluster, and clusters to a group. On the posed body 4 make 33,000 pairs of clusters
 # that meet, 16 make 300,000 pairs of triangles in them to look at; 8 make 16,000 and 210,000.
@@ -73,6 +74,7 @@ class Layout:
         at_vertices: (V, S), adds up at each vertex what belongs to the triangles around it.
         sense: 1 where that is their order in the face, too, as a cycle; else -1.
         apart: pairs of slots of one cluster, where the faces share no vertex.
+        sharing: the same for slots of different clusters, as far as it is kept.
     """
 
     face: Int[np.ndarray, "S"]
@@ -83,6 +85,7 @@ class Layout:
     at_vertices: "scipy.sparse.csr_array"
     sense: Float[np.ndarray, "S"]
     apart: Int[np.ndarray, "2 N"]
+    sharing: Sharing
 
 
 @dataclass
@@ -214,7 +217,8 @@ def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layou
     slot[order] = CLUSTER * np.repeat(number, size) + within
     face = np.full(CLUSTER * total, -1)
     face[slot] = np.arange(len(faces))
-    empty = np.flatnonzero(face < 0)
+    filled = face >= 0
+    empty = np.flatnonzero(~filled)
     face[empty] = 0
     given = faces[face].T
     corners = np.sort(given, axis=0)
@@ -238,4 +242,5 @@ def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layou
         ),
         sense=np.where(turns == 2, 1.0, -1.0),
         apart=np.stack([CLUSTER * cluster + first[pair], CLUSTER * cluster + second[pair]]),
+        sharing=sharing(corners, filled, CLUSTER),
     )

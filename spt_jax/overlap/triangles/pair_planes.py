@@ -16,7 +16,7 @@ def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
     Args:
         reach: how near to a triangle a vertex lies on it.
     """
-    contacts = []
+    near_corners = []
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         height, margin = _heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
@@ -30,10 +30,10 @@ def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
             apart = flat[_apart_in_plane(layout, shape, x[kept[flat]], y[kept[flat]], reach)]
             kept, height, near = (np.delete(of, apart, axis=-1) for of in (kept, height, near))
         on = np.flatnonzero(np.abs(height).min(axis=0) <= near)
-        if len(on):
-            contacts.append(_contacts(layout, shape, x[kept[on]], y[kept[on]], reach))
+        near_corners.append((x[kept[on]], y[kept[on]]))
         t, u = t[kept], u[kept]
-    vertex, face = (np.concatenate(x) for x in zip(_NO_CONTACT, *contacts, strict=True))
+    x, y = (np.concatenate(of) for of in zip(*near_corners, strict=True))
+    vertex, face = _contacts(layout, shape, x, y, reach) if len(x) else _NO_CONTACT
     return t, u, vertex, face
 
 

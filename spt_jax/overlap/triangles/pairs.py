@@ -10,7 +10,7 @@ What is left is decided by the signs of volumes, which are exact (`predicates.py
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from spt_jax.overlap.triangles.pair_boxes import (
     Shape,
@@ -266,13 +266,12 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: Shape):
     constant x_k: once in all exactly if the vertex is the median of x_k in two of its triangles.
     Then they do not overlap. Ties of x_k are broken by vertex number, as if moved by nothing.
     """
-    count = points.shape[1]
-    d = np.stack([layout.at_vertices @ n for n in shape.normal])
+    # All three components at once: the sparse product is read once.
+    d = np.ascontiguousarray((layout.at_vertices @ np.ascontiguousarray(shape.normal.T)).T)
     x, y, z = np.abs(d)
     # argmin along a short axis takes four times as long.
     axis = np.where((x <= y) & (x <= z), 0, np.where(y <= z, 1, 2))
-    every = np.arange(count)
-    d[axis, every] = 0.0
+    d[axis, np.arange(len(axis))] = 0.0
     length = np.abs(d).sum(axis=0)
     d /= np.where(length > 0, length, 1.0)
     at = d.take(layout.corners, axis=1)
@@ -281,20 +280,26 @@ def _uncertain(points, topology: Topology, layout: Layout, shape: Shape):
     facing += at[2] * shape.normal[2]
     away = facing <= ROUNDING * shape.extent * shape.extent
     away[:, layout.empty] = False
-    medians = np.stack([_medians(x, layout, count) for x in shape.corner])
-    sure = topology.closed & (medians[axis, every] == 2)
+    sure = topology.closed & (_medians(shape, layout, axis.astype(np.uint8)) == 2)
     sure[layout.corners[away]] = False
     return np.flatnonzero(~sure)
 
 
-def _medians(x, layout: Layout, count):
-    """In how many of its triangles each vertex has the coordinate between the two others."""
-    # Corners are sorted by number, so this is what breaks ties.
-    first, second, third = x[0] <= x[1], x[1] <= x[2], x[2] < x[0]
-    a, b, c = layout.corners
-    median = np.where(first == second, b, np.where(second == third, c, a))
-    median[layout.empty] = count
-    return np.bincount(median, minlength=count + 1)[:-1]
+def _medians(shape: Shape, layout: Layout, axis: UInt8[np.ndarray, "V"]) -> Int[np.ndarray, "V"]:
+    """In how many of its triangles each vertex is the median, along the axis that it names."""
+    # The number of the median corner along x, y and z, two bits each: bytes take an eighth of what
+    # whole numbers would.
+    medians = np.zeros(shape.corner.shape[2], np.uint8)
+    for k, x in enumerate(shape.corner):
+        # Corners are sorted by number, so this is what breaks ties.
+        first, second, third = x[0] <= x[1], x[1] <= x[2], x[2] < x[0]
+        middle = first == second
+        last = (second == third) & ~middle
+        medians |= (middle.view(np.uint8) | last.view(np.uint8) << 1) << (2 * k)
+    corner = (medians >> 2 * axis.take(layout.corners_32)) & 3
+    found = corner == np.arange(3, dtype=np.uint8)[:, None]
+    found[:, layout.empty] = False
+    return np.bincount(layout.corners.ravel().take(np.flatnonzero(found)), minlength=len(axis))
 
 
 def _straddling(predicates: Predicates, layout: Layout, t, u):
@@ -302,9 +307,8 @@ def _straddling(predicates: Predicates, layout: Layout, t, u):
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         plane, corner = layout.corners.take(y, axis=1), layout.corners.take(x, axis=1)
-        key = np.tile(y, 3) * predicates.points.shape[1] + corner.ravel()
-        side, _ = predicates.volume(np.tile(plane, 3), corner.ravel(), key)
-        kept = np.flatnonzero(np.abs(side.reshape(3, -1).sum(axis=0)) < 3)
+        side, _ = predicates.volume(plane, corner, y * predicates.points.shape[1] + corner)
+        kept = np.flatnonzero(np.abs(side.sum(axis=0)) < 3)
         t, u = t[kept], u[kept]
     return t, u
 
@@ -320,14 +324,12 @@ def _edges_of_pairs(topology: Topology, layout: Layout, t, u):
 def _decide(predicates: Predicates, topology: Topology, layout: Layout, row, slot):
     """The candidates that cross, what part of the edge lies before the crossing, and the jump."""
     corners, ends = layout.corners.take(slot, axis=1), topology.ends.take(row, axis=0).T
-    side, height = (x.reshape(2, -1) for x in predicates.volume(np.tile(corners, 2), ends.ravel()))
+    side, height = predicates.volume(corners, ends)
     kept = np.flatnonzero(side[0] != side[1])
     row, slot, side, height = row[kept], slot[kept], side[0, kept], height[:, kept]
     corners, ends = corners[:, kept], ends[:, kept]
     # The edge passes on one side of all three of the triangle's.
-    start, end = corners.ravel(), corners[[1, 2, 0]].ravel()
-    turn, _ = predicates.volume(np.stack([*np.tile(ends, 3), start]), end)
-    kept = np.flatnonzero(np.abs(turn.reshape(3, -1).sum(axis=0)) == 3)
+    kept = np.flatnonzero(np.abs(predicates.turns(ends, corners).sum(axis=0)) == 3)
     part = predicates.part_before(corners[:, kept], ends[:, kept], np.abs(height[:, kept]))
     jump = side[kept] * layout.sense[slot[kept]].astype(np.int64)
     return row[kept], slot[kept], part, jump

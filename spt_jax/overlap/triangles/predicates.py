@@ -83,23 +83,43 @@ class Predicates:
             depth += self._part / (1.0 + self._part.max(initial=0))
         return np.rint(-_STEP * (depth[:, None] * normal).T) + np.rint(_NOISE * _noise(count))
 
-    def volume(self, base, apex, key=None) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    def volume(
+        self, base, apex, key=None
+    ) -> tuple[Int[np.ndarray, "*M N"], Float[np.ndarray, "*M N"]]:
         """Signs of tetrahedra's volumes, positive where the apex is on the base's normal's side.
 
         Args:
             base: (3, N), the vertices of each tetrahedron's base.
-            apex: (N), its fourth vertex, different from those.
+            apex: (N), its fourth vertex, different from those; or (M, N), several for each base.
             key: numbers that are the same for the same tetrahedra, where many are asked for again.
 
         Returns:
             The signs, +1 or -1, and six times the volumes: to rounding, and 0.0 where they vanish.
         """
-        corners = (*base, apex)
         origin = self.points.take(base[0], axis=1)
-        u, v, w = (self.points.take(x, axis=1) - origin for x in corners[1:])
+        u, v = (self.points.take(x, axis=1) - origin for x in base[1:])
+        w = self.points.take(apex, axis=1)
+        w -= origin if apex.ndim == 1 else origin[:, None]
         value = _determinant(u, v, w)
         bound = _BOUND * (_largest(u) * _largest(v) * _largest(w)) + _LEAST
-        return self._decided(value, bound, corners, (0, 1, 2), key)
+        return self._decided(value, bound, (*base, apex), (0, 1, 2), key)
+
+    def turns(self, edge, triangle) -> Int[np.ndarray, "3 N"]:
+        """On which side of an edge a triangle's sides pass: signs of the volumes pqab, pqbc, pqca.
+
+        Args:
+            edge: (2, N), the vertices p and q.
+            triangle: (3, N), the vertices a, b and c, different from those.
+        """
+        origin = self.points.take(edge[0], axis=1)
+        along = self.points.take(edge[1], axis=1) - origin
+        arms = self.points.take(triangle, axis=1) - origin[:, None]
+        ends = arms[:, [1, 2, 0]]
+        size = _largest(arms)
+        value = _determinant(along[:, None], arms, ends)
+        bound = _BOUND * (_largest(along) * size * size[[1, 2, 0]]) + _LEAST
+        corners = (*edge, triangle, triangle[[1, 2, 0]])
+        return self._decided(value, bound, corners, (0, 1, 2))[0]
 
     def area(self, a, b, c, axes: tuple[int, int]) -> Int[np.ndarray, "N"]:
         """Signs of the areas of triangles seen along an axis: +1 counter-clockwise, -1 clockwise.
@@ -144,14 +164,16 @@ class Predicates:
         return np.clip(part, 0.0, 1.0)
 
     def _decided(self, value, bound, corners, axes, key=None):
-        open_ = np.flatnonzero(np.abs(value) <= bound)
         sign = np.where(value < 0, -1, 1)
-        if len(open_) > _MANY and key is not None:
+        open_ = np.nonzero(np.abs(value) <= bound)
+        if not len(open_[0]):
+            return sign, value
+        corners = [np.broadcast_to(x, value.shape)[open_] for x in corners]
+        if len(corners[0]) > _MANY and key is not None:
             _, first, at = np.unique(key[open_], return_index=True, return_inverse=True)
-            found = self._exactly([x[open_[first]] for x in corners], axes)
+            found = self._exactly([x[first] for x in corners], axes)
             sign[open_], value[open_] = (x[at] for x in found)
-        elif len(open_):
-            corners = [np.broadcast_to(x, value.shape)[open_] for x in corners]
+        else:
             sign[open_], value[open_] = self._exactly(corners, axes)
         return sign, value
 

@@ -276,21 +276,22 @@ def _roots(topology: Topology, manifold: Manifold, predicates: Predicates, layer
 def _outermost_edges(topology: Topology, predicates: Predicates, vertex):
     """Of each vertex the edge that turns least from y, seen along z: all others are on one side."""
     first, count = topology.fan_start[vertex], np.diff(topology.fan_start)[vertex]
-    corner, _ = spread(first, count)
+    corner, of = spread(first, count)
     face, turn = np.divmod(topology.fan[corner], 3)
     half = 3 * face + (turn + 2) % 3  # from the vertex to the next corner
     there = topology.faces[face, (turn + 1) % 3]
-    begin = np.cumsum(count) - count
-    best = begin.copy()
-    for k in range(1, int(count.max(initial=0))):
-        now = np.flatnonzero(count > k)
-        challenger = begin[now] + k
-        same = there[challenger] == there[best[now]]
-        v, u, w = vertex[now], there[best[now]], there[challenger]
-        w = np.where(same, topology.faces[face[challenger], (turn[challenger] + 2) % 3], w)
-        left = predicates.area(v, u, w, (0, 1)) > 0
-        better = now[left & ~same]
-        best[better] = (begin + k)[better]
+    # By the angle from y, to rounding; then the signs tell whether any other turns less.
+    seen = predicates.points[:2]
+    x, y = seen.take(there, axis=1) - seen.take(vertex[of], axis=1)
+    best = np.lexsort((np.arctan2(-x, y), of))[np.cumsum(count) - count]
+    for _ in range(int(count.max(initial=0))):
+        others = np.flatnonzero(there != there[best[of]])
+        own = of[others]
+        left = predicates.area(vertex[own], there[best[own]], there[others], (0, 1)) > 0
+        if left.all():
+            break
+        wrong = np.flatnonzero(~left)
+        best[own[wrong]] = others[wrong]
     row = topology.row[half[best]]
     return row, (topology.ends[row, 1] == vertex).astype(np.int64)
 
