@@ -1,5 +1,6 @@
 """`spt-jax fit`: files in, files out, and what is said of bad ones."""
 
+import io
 import json
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 import trimesh
 from helpers_body import synthetic_smpl
 from PIL import Image
+from rich.console import Console
 
 from spt_jax.body import load_body
 from spt_jax.body.pose_files import read_poses
@@ -19,7 +21,7 @@ from spt_jax.commands.annotated import read_camera, select_people
 from spt_jax.commands.fitting import scenes_of
 from spt_jax.fit import pose as fitting
 from spt_jax.fit.people import Penetration, PeopleResult
-from spt_jax.fit.result import FitResult
+from spt_jax.fit.result import _REASONS, FitResult
 from spt_jax.keypoints import LAYOUTS
 from spt_jax.show.overlay import read_image
 
@@ -350,7 +352,7 @@ def test_keypoints_of_smpl_on_a_body_file(calls, tmp_path, rng, monkeypatch, cap
         (["--joints", "body25"], "person 0 in "),
         (["--joints", "cocoa"], "layout must be one of"),
         (["--robust", "0"], "robust must be a positive number of pixels, auto or off: got 0"),
-        (["--camera", "missing.json"], "camera must be a file: got 'missing.json'"),
+        (["--camera", "missing.json"], "camera file must exist: got 'missing.json'"),
         (["--camera", "c.json", "--focal", "900"], "camera must be given as a file, or by focal"),
         (["--camera", "c.json"], "camera file c.json must hold a 3 x 4 matrix, or focal and c"),
         (["--focal", "-3"], "focal must be positive: got -3"),
@@ -425,8 +427,62 @@ def test_cameras_from_files(tmp_path):
         with pytest.raises(ValueError, match=r"bad\.json"):
             read_camera(tmp_path / "bad.json")
     (tmp_path / "bad.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"bad\.npz must be an \.npz of arrays"):
+    with pytest.raises(ValueError, match=r"camera file must be an \.npz archive: got .*bad\.npz"):
         read_camera(tmp_path / "bad.npz")
+
+
+def test_a_camera_with_distortion_is_refused(tmp_path):
+    (tmp_path / "c.json").write_text('{"focal": 800, "center": [3, 4], "dist_coeffs": [0, 0.1]}')
+    with pytest.raises(ValueError, match=r"c\.json must have no distortion: got 'dist_coeffs'"):
+        read_camera(tmp_path / "c.json")
+    (tmp_path / "c.json").write_text('{"focal": 800, "center": [3, 4], "k1": 0, "dist": [[0, 0]]}')
+    np.testing.assert_allclose(read_camera(tmp_path / "c.json").focal, 800)
+
+
+def test_a_focal_length_in_millimetres_ends_with_1(calls, tmp_path, rng, monkeypatch, capsys):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.mesh_files.write_mesh", lambda *_, **__: None)
+    file = coco_file(tmp_path / "a.json", [(1, person(rng))], {1: (640, 480)})
+    out = tmp_path / "out"
+    assert main(["fit", file, "--out", str(out), "--focal", "35"]) == 1
+    captured = capsys.readouterr()
+    said = "000000000001/0: focal length outside any photograph: what is seen is more than 70"
+    assert said in captured.err and "focal length" in captured.out
+    (one,) = json.loads((out / "report.json").read_text())["people"]
+    assert one["status"] == 6 and one["reason"].startswith("focal length outside any photograph")
+
+
+def test_what_a_file_has_and_is_not_used_is_said(calls, tmp_path, rng, monkeypatch, capsys):
+    without_pictures(monkeypatch)
+    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    points = rng.uniform(50, 400, (133, 2)).round(1)
+    one = {"keypoints": points.tolist(), "keypoint_scores": [0.5] * 16 + [0.04] + [0.9] * 116}
+    (tmp_path / "a.json").write_text(json.dumps([one]))
+    assert main(["fit", str(tmp_path / "a.json"), "--out", str(tmp_path / "out")]) == 0
+    said = "points of feet, face, hands and such after COCO's 17, which are not used: 116"
+    assert said in " ".join(capsys.readouterr().err.split())
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert any(said in note for note in report["notes"])
+    # All scores reach the fit: the stand-in sums them.
+    assert report["people"][0]["terms"]["total"] == pytest.approx(16 * 0.5 + 0.04)
+
+
+@pytest.mark.parametrize("width", [72, 80, 120])
+@pytest.mark.parametrize("code", range(7))
+def test_the_status_is_never_cut_away(code, width):
+    reason = _REASONS[code]
+    given = {"name": "a_long_name_of_a_photograph_0123456789/12", "errors": np.full(17, 123.4)}
+    given |= {"distance": 123.45, "overlap": Overlap, "outside": code > 3, "reason": reason}
+    people = [SimpleNamespace(**given), SimpleNamespace(**given | {"overlap": None})]
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(fitted.people_table(people))
+    lines = console.export_text().splitlines()
+    assert max(map(len, lines)) <= width
+    columns = [line.split("│")[2] for line in lines if line.startswith("│")]
+    assert " ".join(" ".join(columns).split()) == " ".join([reason.split(":")[0]] * 2)
+    names = [line.split("│")[1].strip() for line in lines if line.startswith("│")]
+    assert "".join(names) == given["name"] * 2
 
 
 def test_select_people():

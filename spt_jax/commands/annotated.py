@@ -1,6 +1,5 @@
 """The people of a keypoint file, each with an image and a camera, for `spt-jax fit`."""
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spt_jax.commands.untangle import select_frames
+from spt_jax.file_limits import read_json, read_npz
 
 if TYPE_CHECKING:
     from spt_jax.camera import PinholeCamera
     from spt_jax.keypoints import KeypointFile, Person
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
+_DISTORTION = ("dist", "k1", "k2", "k3", "p1", "p2", "radial", "tangential")
 _LEAST_SIDE = 64  # of an image that is only known by the points in it, in pixels
 
 
@@ -68,6 +69,7 @@ def gather(
     names = [f"{image_name}/{row}" for row, image_name in enumerate(images)]
     rows = select_people(names, images, people)
     notes = [f"left out: {count} people with {why}" for why, count in file.skipped.items()]
+    notes += [f"{path}: {note}" for note in file.notes]
 
     from spt_jax.show.overlay import LARGEST
 
@@ -113,21 +115,11 @@ def read_camera(path: Path) -> "PinholeCamera":
     """
     from spt_jax.camera import PinholeCamera
 
-    if not path.is_file():
-        raise FileNotFoundError(f"camera must be a file: got {str(path)!r}; check the spelling.")
+    what = "camera file"
     if path.suffix.lower() == ".npz":
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                content: Any = {key: archive[key] for key in archive.files}
-        except Exception as error:  # zip, zlib and NumPy fail each in its own way
-            raise ValueError(
-                f"camera file {path} must be an .npz of arrays: got {error}."
-            ) from error
+        content: Any = read_npz(path, what=what).arrays
     else:
-        try:
-            content = json.loads(path.read_bytes().decode("utf-8-sig"))
-        except (ValueError, RecursionError) as error:
-            raise ValueError(f"camera file {path} must be JSON: got {error}.") from error
+        content = read_json(path, what)
     content = {"matrix": content} if isinstance(content, list) else content
     if not isinstance(content, dict) or not (
         "matrix" in content or {"focal", "center"} <= set(content)
@@ -136,6 +128,12 @@ def read_camera(path: Path) -> "PinholeCamera":
         raise ValueError(
             f"camera file {path} must hold a 3 x 4 matrix, or focal and center: got {seen}."
         )
+    for name in content:
+        if name.startswith(_DISTORTION) and np.any(np.asarray(content[name], object) != 0):
+            raise ValueError(
+                f"camera file {path} must have no distortion: got {name!r}; undistort the "
+                "keypoints first, and leave it out."
+            )
     try:
         if "matrix" in content:
             return PinholeCamera.from_matrix(np.asarray(content["matrix"]))

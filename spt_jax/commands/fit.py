@@ -32,15 +32,18 @@ def fit(
     robust: float | Literal["auto", "off"] = "auto",
     fit_shape: bool = False,
     together: bool = False,
+    max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Find the 3D poses of the people in a file of 2D keypoints.
 
-    Takes COCO's annotations and results, OpenPose's JSON, and JSON or .npz files of this project
+    Takes COCO's annotations and results, what MMPose, AlphaPose, Detectron2, Ultralytics and
+    OpenPose write as JSON, and JSON or .npz files of this project
     ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
     .glb of each person coloured by class, a picture of each image with the bodies over it, and
-    report.json. The exit code is 1 if somebody could not be fitted.
+    report.json. The exit code is 1 if somebody could not be fitted, or if what was found lies
+    outside any photograph.
 
     Args:
         keypoints: the file, .json or .npz.
@@ -66,6 +69,8 @@ def fit(
         fit_shape: fit the body's shape too.
         together: fit the people of an image as one scene, so that they do not pass through each
             other either.
+        max_bytes: how large the keypoint file may be, and its arrays once unpacked; not given: 256
+            MiB of JSON, 1 GiB of arrays.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
@@ -80,7 +85,7 @@ def fit(
 
     with user_errors():
         as_fold_distance(fold_distance)
-        file = read_keypoints(keypoints, layout=joints)
+        file = read_keypoints(keypoints, layout=joints, max_bytes=max_bytes)
         chosen, notes = gather(
             keypoints,
             file,
@@ -150,7 +155,8 @@ def fit(
             report["pictures"] = pictures
             report["pictures_left_out"] = missing
             write_json(folder / "report.json", report)
-    lost = [one.name for one in done if not one.usable]
+    lost = [one for one in done if not one.usable]
+    outside = [one for one in done if one.usable and one.outside]
     if json:
         print(json_format.dumps(report, indent=2))
     else:
@@ -168,6 +174,8 @@ def fit(
         )
     if missing:
         show(err_console(quiet), f"Pictures were left out: {missing}", "yellow")
-    for name in lost:
-        show(err_console(quiet), f"{name} could not be fitted; see report.json", "red")
-    return 1 if lost else 0
+    for one in lost:
+        show(err_console(quiet), f"{one.name} could not be fitted; see report.json", "red")
+    for one in outside:
+        show(err_console(quiet), f"{one.name}: {one.reason}; check camera and keypoints", "red")
+    return 1 if lost or outside else 0

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from spt_jax.commands.annotated import Annotated
 from spt_jax.commands.frames import _versions
+from spt_jax.fit import photograph
 from spt_jax.report import IntersectionReport
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _LARGEST_CANVAS = 2000  # pixels of a side, where there is no photograph
 _CUBIC_CENTIMETRES = 1e6
+_LEAST_NAME = 6  # characters of a line of a name, in the table
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,11 @@ class Fitted:
         return self.overlap is not None
 
     @property
+    def outside(self) -> bool:
+        """Whether no photograph could show it: camera or keypoints are in wrong units."""
+        return self.status in photograph.REASONS
+
+    @property
     def errors(self) -> Float[np.ndarray, "seen"]:
         """Distances of the points that were seen from where the body has them, in pixels."""
         person = self.given.person
@@ -80,6 +87,10 @@ def as_fitted(
         with suppress(Unmeasurable):
             overlap = intersection_report(vertices, body.faces, folds=folds)
     root = np.asarray(one.camera.to_camera(result.joints[:1]))[0]
+    status, reason = int(result.status), result.reason
+    if status < 2 and photograph.is_too_wide(one.camera, one.size):
+        status = photograph.FOCAL
+        reason = photograph.REASONS[status]
     return Fitted(
         given=one,
         pose=np.asarray(result.pose),
@@ -89,8 +100,8 @@ def as_fitted(
         keypoints=np.asarray(result.keypoints),
         distance=float(root[2]),
         terms={name: float(value) for name, value in result.terms.items()},
-        status=int(result.status),
-        reason=result.reason,
+        status=status,
+        reason=reason,
         steps=int(result.steps),
         seconds=seconds,
         overlap=overlap,
@@ -103,34 +114,34 @@ def people_table(people: Sequence[Fitted]) -> "Table":
     from rich.table import Table
 
     table = Table(header_style="bold", padding=0, collapse_padding=True)
-    table.add_column("person", overflow="ellipsis", no_wrap=True)
-    for heading in (
-        "points\nseen",
-        "error, px\nmedian",
-        "\nlargest",
-        "distance\nm",
-        "overlap\ncm³",
-        "crossings",
-        "status",
-    ):
-        table.add_column(heading, justify="right", no_wrap=heading != "status")
+    # Where it is narrow the name folds, and what is cut is on the right: never the status.
+    table.add_column("person", overflow="fold", min_width=_LEAST_NAME)
+    words = (word for one in people for word in _short(one).split())
+    width = max((len(word) for word in words), default=0)
+    table.add_column("status", overflow="fold", min_width=width)
+    headings = ("points\nseen", "error, px\nmedian", "\nlargest", "distance\nm", "overlap\ncm³")
+    for heading in (*headings, "crossings"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for one in people:
         if one.overlap is None:
-            blank = [str(len(one.errors)), *[""] * 5]
-            table.add_row(escape(one.name), *blank, f"[red]{one.reason}[/red]")
+            table.add_row(escape(one.name), f"[red]{_short(one)}[/red]", str(len(one.errors)))
             continue
         colour = "green" if one.overlap.volume == 0 else "default"
         table.add_row(
             escape(one.name),
+            f"[red]{_short(one)}[/red]" if one.outside else _short(one),
             str(len(one.errors)),
             f"{np.median(one.errors):.1f}",
             f"{one.errors.max():.1f}",
             f"{one.distance:.2f}",
             f"[{colour}]{one.overlap.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
             f"[{colour}]{one.overlap.crossing_pairs[0]}[/{colour}]",
-            one.reason.split(":")[0],
         )
     return table
+
+
+def _short(one: Fitted) -> str:
+    return one.reason.split(":")[0]
 
 
 def summary(people: Sequence[Fitted]) -> str:
