@@ -1,6 +1,7 @@
 """Who gets into the live view: real requests and sockets, with what an attacker could send."""
 
 import contextlib
+import logging
 import re
 import socket
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ from websockets.exceptions import InvalidStatus
 pytest.importorskip("viser", reason="the live view needs viser")
 
 from helpers_view import Browser, open_socket, page, path_of, port_of, served, wait_until
+from viser._messages import ShareUrlRequest
 
 from spt_jax import cli
 from spt_jax.view.access import access_for, free_port
@@ -182,7 +184,11 @@ def test_the_page_is_handed_out_for_the_token_alone(view):
     assert page(view, f"/..%2f..%2f..%2fpyproject.toml?token={view.access.token}")[0] == 404
 
 
-def test_garbage_before_the_handshake_says_nothing_and_ends_nothing(view, capfd):
+def test_garbage_before_the_handshake_says_nothing_and_ends_nothing(
+    view, capfd, caplog, monkeypatch
+):
+    # viser filters what is logged, but only from the first page on that it hands out.
+    monkeypatch.setattr(logging.getLogger("spt_jax.view.connections"), "filters", [])
     for content in (b"\x16\x03\x01\x02", b"GET / HTTP/1.1\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n"):
         with socket.create_connection(("127.0.0.1", port_of(view)), timeout=10) as stranger:
             stranger.sendall(content)
@@ -194,6 +200,10 @@ def test_garbage_before_the_handshake_says_nothing_and_ends_nothing(view, capfd)
             assert b"200 OK" not in answer and b"101" not in answer
     assert page(view, "/")[0] == 403
     assert capfd.readouterr() == ("", "")
+    # Nor where pytest does not take what is logged: a logger without handlers prints tracebacks.
+    loggers = {record.name for record in caplog.records if record.levelno >= logging.WARNING}
+    assert loggers == {"spt_jax.view.connections"}
+    assert all(logging.getLogger(name).handlers for name in loggers)
 
 
 @pytest.mark.parametrize(
@@ -229,7 +239,7 @@ def test_values_that_no_widget_has_are_ignored_in_one_line(view, capfd):
         browser.set("See through", True)
         browser.set("Measure", "paper's ratio")
         wait_until(lambda: view.scene.paper)
-    assert view.server._share_tunnel is None
+    assert ShareUrlRequest not in view.server._websock_server._incoming_handlers
     said = capfd.readouterr().err
     assert "Traceback" not in said and "a browser's message was ignored: " in said
 

@@ -10,7 +10,7 @@ import trimesh
 
 pytest.importorskip("viser", reason="the live view needs viser")
 
-from helpers_view import PART, Browser, served, wait_until
+from helpers_view import PART, SECONDS, Browser, served, wait_until
 
 from spt_jax.body.pose_files import write_poses
 from spt_jax.view import files
@@ -105,6 +105,20 @@ def test_a_second_file_from_the_same_browser_takes_the_place_of_the_first(view, 
         browser.send_file("half.ply", b"", size=999_999, parts=[(0, b"x" * 1000)])
         browser.send_file("second.ply", ball)
         wait_until(lambda: view.scene.name == "second")
+
+
+def test_files_that_were_shown_leave_nothing_behind(view, ball):
+    buffer = view.server._websock_server._broadcast_buffer
+    with Browser(view) as browser:
+        kept = []
+        for k in range(12):
+            browser.send_file(f"ball{k}.ply", ball)
+            wait_until(lambda k=k: view.scene.name == f"ball{k}")
+            assert view.worker.wait_until_idle(SECONDS)
+            last = buffer.message_counter - 1  # that all of it was sent
+            wait_until(lambda last=last: min(buffer.generator_cursors.values()) >= last)
+            kept.append(len(buffer.message_from_id))
+    assert max(kept[2:]) <= max(kept[:2])
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,14 @@ def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience:
     return server
 
 
+def forget_what_was_removed(server: Any) -> None:
+    """Have viser drop its notes of what is gone, which it does only when a browser comes.
+
+    Every file that is opened leaves ten of them.
+    """
+    server._run_garbage_collector()
+
+
 def stop_quietly(server: Any) -> None:
     """End a viser server without its farewell."""
     with contextlib.redirect_stdout(None):

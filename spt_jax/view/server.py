@@ -15,7 +15,7 @@ from spt_jax.mesh_check import check_mesh
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
 from spt_jax.view.freeing import untangle_scene
-from spt_jax.view.guarded import PATIENCE, start_guarded, stop_quietly
+from spt_jax.view.guarded import PATIENCE, forget_what_was_removed, start_guarded, stop_quietly
 from spt_jax.view.panel import MEASURES, Panel
 from spt_jax.view.scene import Reading, Scene
 from spt_jax.view.stage import Stage
@@ -235,6 +235,7 @@ class View:
             raise ValueError(reading.error)
         self.scene, self._motions = scene, motions
         self._status = "ready" if start is None else motions[start[0]].names[start[1]]
+        forget_what_was_removed(self.server)
         self._stage.begin(scene, reading)
         self.panel = Panel(self.server, scene, motions, start, self._do)
         self._stage.set_handles(scene, self.panel.joints, self._turned)
