@@ -3,20 +3,29 @@
 SPT_JAX_VIEW_PICTURE=benchmarks/figures/view.png has it leave the README's picture.
 """
 
+import contextlib
+import http.server
+import json
 import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
+import trimesh
 
 from spt_jax.body.pose_files import read_poses
 from spt_jax.mesh_files import read_mesh
 
 pytest.importorskip("viser", reason="the live view needs viser")
+
+import viser
+from helpers_view import served
+
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="the browser test needs playwright: pip install playwright"
 )
@@ -58,20 +67,26 @@ def url():
         process.communicate()
 
 
-@pytest.fixture
-def page(url):
+@contextlib.contextmanager
+def opened_page(width, height, *arguments):
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=_CHROMIUM, args=list(_ARGUMENTS))
+        browser = driver.chromium.launch(executable_path=_CHROMIUM, args=[*_ARGUMENTS, *arguments])
         try:
-            picture = "SPT_JAX_VIEW_PICTURE" in os.environ
-            width, height = (1160, 740) if picture else (700, 500)  # software draws the pixels
             page = browser.new_page(viewport={"width": width, "height": height})
             page.set_default_timeout(1000 * _SECONDS)
-            page.goto(url)
-            page.wait_for_selector("#spt-figures")
             yield page
         finally:
             browser.close()
+
+
+@pytest.fixture
+def page(url):
+    picture = "SPT_JAX_VIEW_PICTURE" in os.environ
+    width, height = (1160, 740) if picture else (700, 500)  # software draws the pixels
+    with opened_page(width, height) as page:
+        page.goto(url)
+        page.wait_for_selector("#spt-figures")
+        yield page
 
 
 def volume(page):
@@ -149,3 +164,67 @@ def _leave_picture(page):
         close.click()
     page.wait_for_timeout(3000)
     page.screenshot(path=path)
+
+
+@contextlib.contextmanager
+def http_server_with(text):
+    """The port of a server whose every page holds this."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(text.encode())
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server.server_address[1]
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+# What a page of another site can try. Even the token, which it cannot know, does not help it.
+_ATTACK = """
+async address => {
+    const heard = await new Promise(done => {
+        const socket = new WebSocket("ws://" + address, ["viser-v" + VERSION]);
+        socket.onmessage = () => done("message");
+        socket.onopen = () => done("open");
+        socket.onclose = event => done("closed " + event.code);
+    });
+    const read = await fetch("http://" + address).then(r => r.text(), e => e.name);
+    return [heard, read];
+}
+"""
+
+
+def test_a_page_of_another_site_does_not_reach_the_view(tmp_path):
+    trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "ball.ply")
+    rebound = "--host-resolver-rules=MAP evil.example 127.0.0.1"
+    # Chromium would ask the user first whether the site may look for this machine's servers.
+    permitted = "--disable-features=LocalNetworkAccessChecks"
+    with served(tmp_path / "ball.ply") as view, opened_page(300, 200, rebound, permitted) as page:
+        port, query = view.server.get_port(), f"?token={view.access.token}"
+        attack = _ATTACK.replace("VERSION", json.dumps(viser.__version__))
+        with http_server_with("<p>evil</p>") as evil:
+            page.goto(f"http://127.0.0.1:{evil}")  # another site by its port alone
+            heard, read = page.evaluate(attack, f"127.0.0.1:{port}/{query}")
+            assert (heard, read) == ("closed 1006", "TypeError")
+            page.goto(f"http://evil.example:{evil}")
+            heard, read = page.evaluate(attack, f"127.0.0.1:{port}/{query}")
+            assert (heard, read) == ("closed 1006", "TypeError")
+        # The same name, made to resolve to this machine: the view's page would be of its own site.
+        answer = page.goto(f"http://evil.example:{port}/{query}")
+        assert answer.status == 403 and "Host must name this machine" in page.content()
+        heard, read = page.evaluate(attack, f"evil.example:{port}/{query}")
+        assert heard == "closed 1006" and read.startswith("Host must name this machine")
+        assert not view.server._websock_server._live_connections
+        page.goto(view.url)  # and its own page does
+        page.wait_for_selector("#spt-figures")
