@@ -1,5 +1,6 @@
 """The live view without a browser: what it shows, the files it takes, the thread it works on."""
 
+import os
 import tempfile
 import threading
 import time
@@ -206,6 +207,32 @@ def test_files_are_told_apart(balls, ball_file, pair_file, tmp_path):
     assert files.open_file(pair_file).body is None
     write_poses(tmp_path / "poses.npz", np.zeros((2, 22, 3)))
     assert isinstance(files.open_file(tmp_path / "poses.npz"), PoseFile)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content[:-1],
+        lambda content: content[: len(content) // 2],
+        lambda content: b"PK\5\6" + b"\xff" * 18,
+        lambda content: content.replace(b"PK\1\2", b"PK\1\3"),
+        lambda content: content.replace(b"v_template.npy", b"v_templatE.npy"),
+    ],
+    ids=["last byte", "half", "end alone", "directory", "name"],
+)
+def test_a_damaged_archive_is_refused_by_name(ball_file, damage, tmp_path):
+    (tmp_path / "damaged.npz").write_bytes(damage(ball_file.read_bytes()))
+    with pytest.raises(ValueError, match=r"damaged\.npz"):
+        files.open_file(tmp_path / "damaged.npz")
+
+
+@pytest.mark.parametrize("name", ["pipe.npz", "pipe.ply", "pipe.pkl"])
+def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(
+        ValueError, match=f"must be a regular file: got the device or pipe .*{name}"
+    ):
+        files.open_file(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import re
 import secrets
 import tempfile
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from spt_jax.body import BodyModel, load_body, load_mocap
 from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
 from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.file_limits import as_file, read_npz
 from spt_jax.mesh_check import check_mesh
 from spt_jax.mesh_files import read_mesh, write_mesh
 from spt_jax.view.scene import Reading, Scene
@@ -46,11 +46,11 @@ def open_file(path: Path, name: str | None = None) -> Scene | PoseFile:
         name: what a scene is called; the file's name without its suffix if None.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file cannot be read, or the mesh is not closed and consistently wound.
+        FileNotFoundError, OSError: there is no such file, or the system does not let it be read.
+        ValueError: no regular file, one that cannot be read, or a mesh that is not closed and
+            consistently wound.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"file must exist: got {str(path)!r}; check the spelling")
+    path = as_file(path)  # a pipe would be waited for
     if path.suffix == ".pkl" or _is_model(path):
         return Scene.of_body(load_body(path), name or path.stem)
     if path.suffix.lower() == ".npz":
@@ -158,7 +158,8 @@ def pose_bytes(scene: Scene) -> bytes:
 
 
 def _is_model(path: Path) -> bool:
-    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return "v_template.npy" in archive.namelist()
+    return path.suffix.lower() == ".npz" and "v_template" in read_npz(path, _nothing).names
+
+
+def _nothing(array: str) -> bool:
+    return False
