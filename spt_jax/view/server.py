@@ -258,7 +258,8 @@ class View:
 
     def _report(self, error: Exception) -> None:
         message = " ".join(str(error).split())
-        if not isinstance(error, OSError | TypeError | ValueError):
+        # ImportError: a package that a format needs.
+        if not isinstance(error, ImportError | OSError | TypeError | ValueError):
             traceback.print_exception(error, file=sys.stderr)
             message = f"{type(error).__name__}: {message}"
         self._status = message
