@@ -4,6 +4,7 @@ A few bytes can announce terabytes. Nothing here allocates by an announced size 
 compared with the bytes that there are and with a limit that the caller can raise.
 """
 
+import io
 import json
 import math
 import os
@@ -268,6 +269,24 @@ def read_npz(
             with _named_field(n, name):
                 arrays[n] = _array(archive, member, *headers[n])
     return Npz(arrays, names)
+
+
+def check_archive(
+    content: bytes, what: str, path: str | os.PathLike[str], *, max_bytes: int | None = None
+) -> None:
+    """Do nothing for a zip archive whose members unpack to no more than the limit.
+
+    Raises:
+        TooLargeError: they unpack to more.
+        ValueError: it is no archive.
+    """
+    name = os.fspath(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = archive.infolist()
+    except _DAMAGE as error:
+        raise ValueError(f"{what} must be a zip archive: got {name!r} ({error}).") from error
+    check_bytes(what, path, sum(member.file_size for member in members), max_bytes)
 
 
 @contextmanager

@@ -200,9 +200,6 @@ def test_glb_with_split_vertices_reads_as_closed(tmp_path):
     soup.export(tmp_path / "c.glb")
     read, triangles = read_mesh(tmp_path / "c.glb")
     assert len(read) == 8 and is_closed(read, triangles)
-    # A format with its own indices is taken at its word.
-    soup.export(tmp_path / "c.ply")
-    assert len(read_mesh(tmp_path / "c.ply")[0]) == 36
 
 
 @pytest.mark.parametrize("suffix", ["obj", "glb", "ply"])
@@ -235,7 +232,7 @@ def test_mesh_files_that_are_refused(tmp_path):
     with pytest.raises(ValueError, match="got the folder"):
         read_mesh(tmp_path)
     (tmp_path / "a.blend").write_text("")
-    with pytest.raises(ValueError, match="must have a suffix"):
+    with pytest.raises(ValueError, match="must have one of the suffixes"):
         read_mesh(tmp_path / "a.blend")
     (tmp_path / "a.ply").write_text("ply\n")
     with pytest.raises(ValueError, match=r"readable \.ply file"):
@@ -244,7 +241,7 @@ def test_mesh_files_that_are_refused(tmp_path):
     with pytest.raises(ValueError, match="must hold triangles"):
         read_mesh(tmp_path / "a.obj")
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "p.ply")
-    with pytest.raises(ValueError, match=r"must hold triangles.*PointCloud"):
+    with pytest.raises(ValueError, match=r"must hold triangles.*point cloud of 3 points.*reconstruct"):
         read_mesh(tmp_path / "p.ply")
     (tmp_path / "n.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match=r"n\.off.*vertices must be finite.*vertex 1"):

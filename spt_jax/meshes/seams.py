@@ -1,0 +1,80 @@
+"""Surfaces that a file split along seams, closed again."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+# How far apart rounding leaves two computations of one coordinate, in units in the last place of
+# the largest coordinate along its axis.
+_ROUNDING_STEPS = 4
+# So many pairs a vertex within rounding of each other are no seam but a crowd.
+_MOST_NEIGHBOURS = 16
+
+
+def closed_seams(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], double: bool
+) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"], Int[np.ndarray, "V"], int]:
+    """The mesh with vertices joined that were one before the file was written.
+
+    Only vertices on edges that find no partner running the other way are joined, because a split
+    vertex always has one: every seam closes, and finished surfaces stay as they are. First those at
+    exactly the same position; then, where edges are still open, those within rounding: four units
+    in the last place of the largest coordinate along each axis, and no more.
+
+    Args:
+        vertices, faces: the mesh.
+        double: whether positions are rounded to double precision, or to single.
+
+    Returns:
+        Vertices and faces, in their order; of each vertex given, the one that stands for it; and
+        how many triangles collapsed and are gone.
+    """
+    same = np.arange(len(vertices))
+    collapsed = 0
+    for match in (_at_one_place, _within_rounding):
+        tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        partner_of = head * len(vertices) + tail
+        unpaired = ~np.isin(tail * len(vertices) + head, partner_of)
+        loose = np.unique(np.concatenate([tail[unpaired], head[unpaired]]))
+        if not len(loose):
+            break
+        stands_for = np.arange(len(vertices))
+        stands_for[loose] = loose[match(vertices, loose, double)]
+        joined = stands_for[faces]
+        gone = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+        gone &= ~(faces == np.roll(faces, 1, axis=1)).any(axis=1)
+        collapsed += int(gone.sum())
+        faces, same = joined[~gone], stands_for[same]
+    kept = np.zeros(len(vertices), bool)
+    kept[same] = True
+    place = np.cumsum(kept) - 1
+    return vertices[kept], place[faces], place[same], collapsed
+
+
+def _at_one_place(vertices: np.ndarray, loose: np.ndarray, double: bool) -> np.ndarray:
+    """Of each loose vertex, the first of them in the same place."""
+    _, first, group = np.unique(
+        vertices[loose] + 0.0,  # -0.0 becomes 0.0
+        axis=0,
+        return_index=True,
+        return_inverse=True,
+    )
+    return first[group.ravel()]
+
+
+def _within_rounding(vertices: np.ndarray, loose: np.ndarray, double: bool) -> np.ndarray:
+    """Of each loose vertex, the first of those within rounding of it and of each other."""
+    size = np.abs(vertices).max(axis=0)
+    spacing = np.spacing(size if double else size.astype(np.float32)).astype(np.float64)
+    allowed = _ROUNDING_STEPS * spacing
+    tree = KDTree(vertices[loose] / np.where(allowed > 0, allowed, 1.0))
+    itself = np.arange(len(loose))
+    if tree.count_neighbors(tree, 1.0, p=np.inf) > _MOST_NEIGHBOURS * len(loose):
+        return itself
+    pairs = tree.query_pairs(1.0, p=np.inf, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(loose), len(loose)))
+    _, group = connected_components(graph, directed=False)
+    _, first = np.unique(group, return_index=True)
+    return first[group]

@@ -1,0 +1,76 @@
+"""Stereolithography, .stl: three corners for each triangle, as text or binary.
+
+trimesh 5.2 takes a binary file with a byte too many for text, leaves out a solid that ends with
+"end solid", and lets the numbers of a damaged line slip into the next vertex.
+"""
+
+import re
+
+import numpy as np
+
+from .raw import RawMesh, UnreadableError, holds_double
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_LOOP = re.compile(rb"outer\s+loop(.*?)end\s*loop", re.S | re.I)
+_NUMBER = rb"[-+.0-9a-zA-Z]+"
+_CORNERS = re.compile(
+    rb"\s*" + rb"\s+".join([rb"vertex" + 3 * (rb"\s+(" + _NUMBER + rb")")] * 3) + rb"\s*", re.I
+)
+
+
+def read_stl(content: bytes) -> RawMesh:
+    """The triangles of an .stl file, none sharing a vertex.
+
+    Raises:
+        UnreadableError: it is cut, or damaged.
+    """
+    announced = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
+    expected = 84 + 50 * announced
+    text = (
+        content[:512].lstrip().lower().startswith(b"solid") and b"facet" in content[:2048].lower()
+    )
+    if announced >= 0 and (len(content) == expected or not text):
+        return _binary(content, announced, expected)
+    if not content.lstrip()[:5].lower() == b"solid":
+        raise UnreadableError(
+            "it is neither a binary .stl, which has 84 bytes at least, nor a text"
+        )
+    return _text(content)
+
+
+def _binary(content: bytes, announced: int, expected: int) -> RawMesh:
+    if len(content) < expected:
+        raise UnreadableError(
+            f"it announces {announced:,} triangles, {expected:,} bytes, and has {len(content):,}; "
+            "it is cut"
+        )
+    facets = np.frombuffer(content, _FACET, announced, 84)
+    notes = ()
+    if len(content) > expected:
+        notes = (f"{len(content) - expected:,} bytes after the last triangle are left out",)
+    extras = ("attributes or colours of triangles",) if facets["attribute"].any() else ()
+    corners = facets["corners"].reshape(-1, 3).astype(np.float64)
+    return RawMesh(corners, _in_threes(corners), extras=extras, notes=notes)
+
+
+def _text(content: bytes) -> RawMesh:
+    numbers: list[bytes] = []
+    loops = 0
+    for loops, loop in enumerate(_LOOP.finditer(content), 1):
+        corners = _CORNERS.fullmatch(loop[1])
+        if corners is None:
+            seen = b" ".join(loop[1].split())[:60].decode("latin-1")
+            raise UnreadableError(f"triangle {loops - 1} must have three vertices: got {seen!r}")
+        numbers += corners.groups()
+    begun = len(re.findall(rb"outer\s+loop", content, re.I))
+    if begun != loops:
+        raise UnreadableError(f"triangle {loops} has no end; it is cut")
+    try:
+        vertices = np.array(numbers, np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise UnreadableError(f"a vertex does not hold numbers ({error})") from None
+    return RawMesh(vertices, _in_threes(vertices), double=holds_double(vertices))
+
+
+def _in_threes(corners: np.ndarray) -> np.ndarray:
+    return np.arange(len(corners)).reshape(-1, 3)
