@@ -14,10 +14,11 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from spt_jax.overlap.exclusions import Exclusions, part_rules
 from spt_jax.overlap.triangles.closed_form import Shares, shares_of, volumes_of
+from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours, find_contours
 from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
 from spt_jax.overlap.triangles.pair_layout import Topology, prepared
-from spt_jax.overlap.triangles.pairs import Contacts, EdgeCrossings, find_intersections
+from spt_jax.overlap.triangles.pairs import EdgeCrossings, find_intersections
 from spt_jax.overlap.triangles.predicates import Predicates
 from spt_jax.overlap.triangles.regions import connected_regions
 from spt_jax.overlap.triangles.winding import Ends, enclosing_parts, labels_of, winding_numbers
@@ -60,7 +61,7 @@ class ExactSurface:
         manifold: the surface closed and cut into sheets.
         scale: coordinates are multiplied by this, a power of two.
         points: the new vertices' scaled positions.
-        crossings, contacts, contours: where the surface meets itself.
+        crossings, contours: where the surface meets itself.
         proper: which of the contours' pairs intersect, and do not only touch.
 
     Raises:
@@ -92,11 +93,15 @@ class ExactSurface:
         self.topology: Topology = prepared(self._faces, len(placed)).topology
         self._reach = _CONTACT * rounding
         self.crossings: EdgeCrossings
-        self.contacts: Contacts
-        self.crossings, self.contacts = find_intersections(
+        self.crossings, self._find_contacts = find_intersections(
             self.points, self._faces, predicates=self.predicates, reach=self._reach
         )
         self.contours = find_contours(self.points, self.topology, self.crossings)
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """Vertices that lie on triangles which are not theirs."""
+        return self._find_contacts()
 
     @cached_property
     def proper(self) -> Bool[np.ndarray, "P"]:

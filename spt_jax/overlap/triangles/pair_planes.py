@@ -1,4 +1,4 @@
-"""Pairs of triangles against each other's planes: which may intersect, and which touch."""
+"""Pairs of triangles against each other's planes: which may intersect, and which may touch."""
 
 import numpy as np
 
@@ -7,19 +7,21 @@ from spt_jax.overlap.triangles.pair_layout import Layout
 
 # Relative to the size of what is multiplied, far above float64's rounding.
 ROUNDING = 1e-14
-_NO_CONTACT = np.zeros((2, 0), np.int64)
 
 
 def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
-    """The pairs that neither's plane keeps apart; and vertices that lie on the other triangle.
+    """The pairs that neither's plane keeps apart; and those with a corner in the other's plane.
 
     Args:
-        reach: how near to a triangle a vertex lies on it.
+        reach: how near to a plane a corner lies in it.
+
+    Returns:
+        The slots t and u of the pairs; and (2, N), slots with such a corner, and of such a plane.
     """
     near_corners = []
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
-        height, margin = _heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
+        height, margin = heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
         near = reach * shape.length.take(y)
         np.maximum(margin, near, out=margin)
         kept = np.flatnonzero((height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin))
@@ -30,11 +32,9 @@ def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
             apart = flat[_apart_in_plane(layout, shape, x[kept[flat]], y[kept[flat]], reach)]
             kept, height, near = (np.delete(of, apart, axis=-1) for of in (kept, height, near))
         on = np.flatnonzero(np.abs(height).min(axis=0) <= near)
-        near_corners.append((x[kept[on]], y[kept[on]]))
+        near_corners.append(np.stack([x[kept[on]], y[kept[on]]]))
         t, u = t[kept], u[kept]
-    x, y = (np.concatenate(of) for of in zip(*near_corners, strict=True))
-    vertex, face = _contacts(layout, shape, x, y, reach) if len(x) else _NO_CONTACT
-    return t, u, vertex, face
+    return t, u, np.concatenate(near_corners, axis=1)
 
 
 def _apart_in_plane(layout: Layout, shape: Shape, x, y, reach: float):
@@ -48,34 +48,19 @@ def _apart_in_plane(layout: Layout, shape: Shape, x, y, reach: float):
         for k in range(3):
             start = corner[:, k]
             side = corner[:, (k + 1) % 3] - start
-            inward = _dot(cross(normal, side)[:, None] * sense, points - start[:, None])
-            size = np.sqrt(_dot(side, side)) * length
+            inward = dot(cross(normal, side)[:, None] * sense, points - start[:, None])
+            size = np.sqrt(dot(side, side)) * length
             apart |= inward.max(axis=0) < -np.maximum(reach, ROUNDING * extent) * size
     return apart
 
 
-def _contacts(layout: Layout, shape: Shape, x, y, reach: float):
-    """The corners of triangles x that lie on triangles y: vertices and faces."""
-    points, normal = shape.corner.take(x, axis=2), shape.normal.take(y, axis=1)
-    length, sense = shape.length.take(y), layout.sense.take(y)
-    on = np.abs(_heights(shape, points, shape.extent.take(x), y)[0]) <= reach * length
-    on &= length > 0
-    a, b, c = shape.corner.take(y, axis=2).transpose(1, 0, 2)
-    for start, end in ((a, b), (b, c), (c, a)):
-        side = end - start
-        inward = _dot(cross(normal, side)[:, None] * sense, points - start[:, None])
-        on &= inward >= -reach * length * np.sqrt(_dot(side, side))
-    corner, pair = np.nonzero(on)
-    return layout.corners[corner, x[pair]], layout.face[y[pair]]
-
-
 def straddles(shape: Shape, points, extent, slot):
     """Whether points (3, N, M) lie on both sides of the planes of M triangles, or may."""
-    height, margin = _heights(shape, points, extent, slot)
+    height, margin = heights(shape, points, extent, slot)
     return (height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin)
 
 
-def _heights(shape: Shape, points, extent, slot):
+def heights(shape: Shape, points, extent, slot):
     """Heights of points (3, N, M) above the planes of M triangles, and what rounding may add."""
     normal, corner = shape.normal.take(slot, axis=1), shape.corner[:, 0].take(slot, axis=1)
     height = normal[0] * (points[0] - corner[0])
@@ -85,5 +70,6 @@ def _heights(shape: Shape, points, extent, slot):
     return height, ROUNDING * own * own * (own + extent)
 
 
-def _dot(x, y):
+def dot(x, y):
+    """Dot products of the columns."""
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]

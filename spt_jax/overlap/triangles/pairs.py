@@ -7,11 +7,13 @@ that share no vertex are found by boxes: of clusters of neighbours, then of the 
 What is left is decided by the signs of volumes, which are exact (`predicates.py`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
 from spt_jax.overlap.triangles.pair_boxes import (
     Shape,
     concatenate,
@@ -60,22 +62,6 @@ class EdgeCrossings:
 
     def only(self, kept: Bool[np.ndarray, "K"]) -> "EdgeCrossings":
         """Some of the crossings."""
-        return replace(self, **{name: value[kept] for name, value in vars(self).items()})
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """Vertices that lie on triangles which are not theirs, but for rounding.
-
-    Attributes:
-        vertex, face: the two.
-    """
-
-    vertex: Int[np.ndarray, "T"]
-    face: Int[np.ndarray, "T"]
-
-    def only(self, kept: Bool[np.ndarray, "T"]) -> "Contacts":
-        """Some of the contacts."""
         return replace(self, **{name: value[kept] for name, value in vars(self).items()})
 
 
@@ -129,8 +115,8 @@ def find_intersections(
     among: Bool[np.ndarray, "F"] | None = None,
     predicates: Predicates | None = None,
     reach: float = 0.0,
-) -> tuple[EdgeCrossings, Contacts]:
-    """`edge_crossings`, and the vertices that lie on other triangles.
+) -> tuple[EdgeCrossings, Callable[[], Contacts]]:
+    """`edge_crossings`, and what finds the vertices that lie on other triangles when it is called.
 
     Args:
         vertices, faces, among: as there.
@@ -138,11 +124,10 @@ def find_intersections(
         reach: how near to a triangle a vertex lies on it, against the largest coordinate.
     """
     nothing = np.zeros(0, np.int64)
-    untouched = Contacts(nothing, nothing)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         pairs, places = np.zeros((0, 2), np.int64), np.zeros((0, 3))
         none = EdgeCrossings(pairs, pairs, nothing, nothing, np.zeros(0), places, nothing)
-        return none, untouched
+        return none, lambda: Contacts(nothing, nothing)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise IndexError(
             f"faces must index into vertices: got indices {faces.min()} to {faces.max()} for "
@@ -158,10 +143,11 @@ def find_intersections(
     touching = None if among is None else _touching(topology, among)
     layout, shape, clusters, groups = near_groups(mesh, points)
     found = list(_around_vertices(points, topology, layout, shape))
-    contacts, seen, most = [], 0, _MOST_PAIRS + _MOST_PAIRS_EACH * len(faces)
+    seen, most = 0, _MOST_PAIRS + _MOST_PAIRS_EACH * len(faces)
+    near = [np.zeros((2, 0), np.int64)]
     for t, u in near_pairs(layout, shape, clusters, groups, touching):
-        t, u, *contact = not_apart(layout, shape, t, u, reach)
-        contacts.append(contact)
+        t, u, in_plane = not_apart(layout, shape, t, u, reach)
+        near.append(in_plane)
         seen += len(t)
         if seen > most:
             raise Entangled(
@@ -182,11 +168,7 @@ def find_intersections(
     p, q = np.float64(vertices[ends[:, 0]]), np.float64(vertices[ends[:, 1]])
     point = p + part[:, None] * (q - p)
     found = EdgeCrossings(ends, topology.edge_faces[row], row, face, part, point, jump)
-    if not contacts:
-        return found, untouched
-    vertex, face = np.concatenate(contacts, axis=1)
-    # As single numbers they sort ten times as fast as by rows.
-    return found, Contacts(*np.divmod(np.unique(vertex * len(faces) + face), len(faces)))
+    return found, lambda: contacts_of(layout, shape, np.concatenate(near, axis=1), reach)
 
 
 def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
