@@ -23,6 +23,7 @@ from spt_jax.fit import pose as fitting
 from spt_jax.fit.people import Penetration, PeopleResult
 from spt_jax.fit.result import _REASONS, FitResult
 from spt_jax.keypoints import LAYOUTS
+from spt_jax.report import IntersectionReport
 from spt_jax.show.overlay import read_image
 
 COCO = LAYOUTS["coco17"]
@@ -181,7 +182,7 @@ def test_people_cameras_photographs_and_shape_are_as_asked_for(
 
 def test_the_report_as_json_and_no_robust_loss(calls, tmp_path, rng, monkeypatch, capsys):
     without_pictures(monkeypatch)
-    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.report.intersection_report", no_overlap)
     people = [(1, person(rng)) for _ in range(3)]
     file = coco_file(tmp_path / "a.json", people, {1: (640, 480)})
     out = tmp_path / "out"
@@ -198,7 +199,7 @@ def test_the_report_as_json_and_no_robust_loss(calls, tmp_path, rng, monkeypatch
 
 def test_people_of_an_image_together(calls, tmp_path, rng, monkeypatch, capsys):
     without_pictures(monkeypatch)
-    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.report.intersection_report", no_overlap)
     before = Penetration(*(jnp.asarray(x) for x in (2e-6, 1e-6, 9, 4)))
     scenes = []
 
@@ -248,9 +249,9 @@ def test_what_is_a_fold_reaches_the_fit_and_the_report(
     without_pictures(monkeypatch)
     reports, scenes = [], []
 
-    def report(*_, folds):
+    def report(vertices, *_, folds):
         reports.append(folds)
-        return Overlap
+        return no_overlap(vertices)
 
     def together(body, keypoints, camera, **options):
         scenes.append(options.pop("fold_distance"))
@@ -287,17 +288,21 @@ def test_a_scene_has_one_layout():
         scenes_of([of("coco17"), of("body25")])
 
 
-class Overlap:
+def no_overlap(vertices, *_, **__):
     """In place of a report, where none is looked at."""
-
-    volume, total_volume = 0.0, 2e-6
-    crossing_pairs = (0, 3)
-    labels = None
-
-    @staticmethod
-    def as_dict():
-        """Nothing."""
-        return {}
+    return IntersectionReport(
+        volume=0.0,
+        total_volume=2e-6,
+        solid_volume=0.0,
+        directions=(),
+        volumes=(),
+        labels=np.zeros(len(vertices), np.int8),
+        crossing_pairs=(0, 3),
+        rays="auto",
+        crossings=(),
+        open_rays=(),
+        exact=True,
+    )
 
 
 def test_somebody_who_cannot_be_fitted_is_named(tmp_path, rng, monkeypatch, capsys, calls):
@@ -315,7 +320,7 @@ def test_somebody_who_cannot_be_fitted_is_named(tmp_path, rng, monkeypatch, caps
         return FitResult(**(vars(found) | dict(vertices=vertices, terms=terms, status=status)))
 
     monkeypatch.setattr("spt_jax.fit.pose.fit_pose", loses_the_second)
-    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.report.intersection_report", no_overlap)
     people = [(1, person(rng)), (1, person(rng, missing=1))]
     file = coco_file(tmp_path / "a.json", people, {1: (640, 480)})
     out = tmp_path / "out"
@@ -330,7 +335,7 @@ def test_somebody_who_cannot_be_fitted_is_named(tmp_path, rng, monkeypatch, caps
 def test_keypoints_of_smpl_on_a_body_file(calls, tmp_path, rng, monkeypatch, capsys):
     without_pictures(monkeypatch)
     np.savez(tmp_path / "model.npz", **synthetic_smpl(rng, joints=24))
-    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.report.intersection_report", no_overlap)
     np.savez(tmp_path / "a.npz", keypoints=rng.uniform(50, 200, (24, 2)))
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps([[500, 0, 100, 0], [0, 400, 90, 0], [0, 0, 1, 0]]))
@@ -441,7 +446,7 @@ def test_a_camera_with_distortion_is_refused(tmp_path):
 
 def test_a_focal_length_in_millimetres_ends_with_1(calls, tmp_path, rng, monkeypatch, capsys):
     without_pictures(monkeypatch)
-    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.report.intersection_report", no_overlap)
     monkeypatch.setattr("spt_jax.mesh_files.write_mesh", lambda *_, **__: None)
     file = coco_file(tmp_path / "a.json", [(1, person(rng))], {1: (640, 480)})
     out = tmp_path / "out"
@@ -455,7 +460,7 @@ def test_a_focal_length_in_millimetres_ends_with_1(calls, tmp_path, rng, monkeyp
 
 def test_what_a_file_has_and_is_not_used_is_said(calls, tmp_path, rng, monkeypatch, capsys):
     without_pictures(monkeypatch)
-    monkeypatch.setattr("spt_jax.report.intersection_report", lambda *_, **__: Overlap)
+    monkeypatch.setattr("spt_jax.report.intersection_report", no_overlap)
     points = rng.uniform(50, 400, (133, 2)).round(1)
     one = {"keypoints": points.tolist(), "keypoint_scores": [0.5] * 16 + [0.04] + [0.9] * 116}
     (tmp_path / "a.json").write_text(json.dumps([one]))
@@ -473,7 +478,7 @@ def test_what_a_file_has_and_is_not_used_is_said(calls, tmp_path, rng, monkeypat
 def test_the_status_is_never_cut_away(code, width):
     reason = _REASONS[code]
     given = {"name": "a_long_name_of_a_photograph_0123456789/12", "errors": np.full(17, 123.4)}
-    given |= {"distance": 123.45, "overlap": Overlap, "outside": code > 3, "reason": reason}
+    given |= {"distance": 123.45, "overlap": no_overlap([]), "outside": code > 3, "reason": reason}
     people = [SimpleNamespace(**given), SimpleNamespace(**given | {"overlap": None})]
     console = Console(width=width, record=True, file=io.StringIO())
     console.print(fitted.people_table(people))

@@ -2,6 +2,7 @@
 
 import json as json_format
 import time
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +33,7 @@ def fit(
     robust: float | Literal["auto", "off"] = "auto",
     fit_shape: bool = False,
     together: bool = False,
+    anew: bool = False,
     max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
@@ -43,7 +45,8 @@ def fit(
     ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
     .glb of each person coloured by class, a picture of each image with the bodies over it, and
     report.json. The exit code is 1 if somebody could not be fitted, or if what was found lies
-    outside any photograph.
+    outside any photograph. What is done is kept in OUT/unfinished until all is: a run that was
+    ended goes on with the same command.
 
     Args:
         keypoints: the file, .json or .npz.
@@ -69,6 +72,7 @@ def fit(
         fit_shape: fit the body's shape too.
         together: fit the people of an image as one scene, so that they do not pass through each
             other either.
+        anew: throw away what is done of an unfinished run in the folder.
         max_bytes: how large the keypoint file may be, and its arrays once unpacked; not given: 256
             MiB of JSON, 1 GiB of arrays.
         json: print the report as JSON in place of the table.
@@ -107,8 +111,9 @@ def fit(
             summary,
             write_bodies,
         )
-        from spt_jax.commands.fitting import fit_everyone, scenes_of
+        from spt_jax.commands.fitting import fit_everyone, made_from, scenes_of
         from spt_jax.commands.frames import left_out
+        from spt_jax.commands.unfinished import UnfinishedRun, manifest_of
 
         with user_errors():
             groups = scenes_of(chosen) if together else [[one] for one in chosen]
@@ -123,38 +128,40 @@ def fit(
             )
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
-        done, scenes = fit_everyone(
-            model,
-            groups,
-            regulariser=regulariser,
-            fold_distance=fold_distance,
-            robust=robust,
-            fit_shape=fit_shape,
-            state=state,
-        )
+        options = {
+            "regulariser": regulariser,
+            "fold_distance": fold_distance,
+            "robust": robust,
+            "fit_shape": fit_shape,
+        }
         with user_errors():
-            state("writing", done=len(chosen))
-            meshes = write_bodies(folder, done, model, fit_shape)
-            state("drawing")  # after the rest is safe
-            pictures, missing = draw(folder, done, model.faces)
-            settings = {
-                "keypoints": str(keypoints),
-                "joints": joints,
-                "people": people,
-                "body": body,
-                "regulariser": regulariser,
-                "fold_distance": fold_distance,
-                "robust": robust,
-                "fit_shape": fit_shape,
-                "together": together,
-            }
-            report = as_report(done, scenes, settings)
-            report["seconds"] = round(time.perf_counter() - start, 3)
-            report["notes"] = notes
-            report["meshes"] = meshes
-            report["pictures"] = pictures
-            report["pictures_left_out"] = missing
-            write_json(folder / "report.json", report)
+            manifest = manifest_of(
+                "fit", options | {"together": together}, model, made_from(groups)
+            )
+            run = UnfinishedRun(folder, manifest, say=partial(show, err_console(quiet)), anew=anew)
+        with run:
+            done, scenes = fit_everyone(model, groups, **options, state=state, run=run)
+            with user_errors():
+                state("writing", done=len(chosen))
+                meshes = write_bodies(folder, done, model, fit_shape)
+                state("drawing")  # after the rest is safe
+                pictures, missing = draw(folder, done, model.faces)
+                settings = {
+                    "keypoints": str(keypoints),
+                    "joints": joints,
+                    "people": people,
+                    "body": body,
+                    **options,
+                    "together": together,
+                }
+                report = as_report(done, scenes, settings)
+                report["seconds"] = round(time.perf_counter() - start, 3)
+                report["notes"] = notes
+                report["meshes"] = meshes
+                report["pictures"] = pictures
+                report["pictures_left_out"] = missing
+                write_json(folder / "report.json", report)
+                run.finish()
     lost = [one for one in done if not one.usable]
     outside = [one for one in done if one.usable and one.outside]
     if json:

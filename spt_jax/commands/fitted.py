@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from spt_jax.commands.annotated import Annotated
-from spt_jax.commands.frames import _versions
+from spt_jax.commands.frames import versions
 from spt_jax.fit import photograph
 from spt_jax.report import IntersectionReport
 
@@ -176,7 +176,7 @@ def as_report(
     """What report.json holds."""
     return {
         "command": "fit",
-        "versions": _versions(),
+        "versions": versions(),
         "settings": settings,
         "units": {"length": "m", "image": "px", "volume": "m^3", "time": "s", "angle": "rad"},
         "people": [_person_report(one) for one in people],

@@ -10,10 +10,12 @@ import numpy as np
 
 from spt_jax.commands.annotated import Annotated
 from spt_jax.commands.fitted import Fitted, as_fitted
-from spt_jax.commands.terminal import State
+from spt_jax.commands.kept import people_arrays, people_of
+from spt_jax.commands.terminal import State, user_errors
 
 if TYPE_CHECKING:
     from spt_jax.body import BodyModel
+    from spt_jax.commands.unfinished import UnfinishedRun
     from spt_jax.fit.people import Penetration
 
 Named = Literal["spt", "none", "spheres", "laplacian"]
@@ -49,6 +51,18 @@ def scenes_of(people: Sequence[Annotated]) -> list[list[Annotated]]:
     return list(groups.values())
 
 
+def made_from(groups: Sequence[Sequence[Annotated]]) -> list[tuple[str, list[Any]]]:
+    """The name of each group, and all that its fit is made from."""
+    found = []
+    for group in groups:
+        given: list[Any] = [group[0].image, group[0].size]
+        for one in group:
+            given += [one.name, one.person.layout, one.person.points, one.person.confidence]
+        given += [*jax.tree.leaves(group[0].camera), group[0].camera.near]
+        found.append((group[0].name if len(group) == 1 else group[0].image, given))
+    return found
+
+
 def fit_everyone(
     body: "BodyModel",
     groups: Sequence[Sequence[Annotated]],
@@ -58,11 +72,13 @@ def fit_everyone(
     robust: Robust,
     fit_shape: bool,
     state: State,
+    run: "UnfinishedRun",
 ) -> tuple[list[Fitted], list[dict[str, Any]]]:
     """Fit everyone, and measure the bodies' overlaps.
 
     Group by group, so that each may have a camera and the bar moves on; it compiles once a layout
-    and size of a group. A group of one is fitted alone, one of several as a scene.
+    and size of a group. A group of one is fitted alone, one of several as a scene. `run` keeps each
+    group as it is done, and has those that were done before.
 
     Returns:
         The people, group by group; and of each scene what report.json says.
@@ -78,7 +94,13 @@ def fit_everyone(
     prepared = term.prepared(body, 1)
     folds = as_fold_surface(body, fold_distance)
     found, told, compiled = [], [], set()
-    for group in groups:
+    for number, group in enumerate(groups):
+        kept = run.found(number)
+        if kept is not None:
+            people, scene = people_of(kept, group)
+            found += people
+            told += [] if scene is None else [scene]
+            continue
         key = (group[0].person.layout, len(group))
         name = group[0].name if len(group) == 1 else f"{group[0].image}, {len(group)} people"
         wait = "" if key in compiled else "compiling (10 to 40 s), then "
@@ -93,18 +115,17 @@ def fit_everyone(
             "fit_shape": fit_shape,
         }
         points = np.stack([one.person.points for one in group]).astype(np.float32)
+        scene = None
         if len(group) > 1:
             options["fold_distance"] = fold_distance
-            scene = scenes.fit_people(body, points, group[0].camera, **options)
-            results = scene.people
-            told.append(
-                {
-                    "image": group[0].image,
-                    "people": [one.name for one in group],
-                    "before": _penetration_report(scene.before),
-                    "after": _penetration_report(scene.after),
-                }
-            )
+            together = scenes.fit_people(body, points, group[0].camera, **options)
+            results = together.people
+            scene = {
+                "image": group[0].image,
+                "people": [one.name for one in group],
+                "before": _penetration_report(together.before),
+                "after": _penetration_report(together.after),
+            }
         else:
             each = ("confidence", "robust")
             options |= {k: options[k] if options[k] is None else options[k][0] for k in each}
@@ -113,9 +134,15 @@ def fit_everyone(
         results = jax.tree.map(np.asarray, results)
         seconds = (time.perf_counter() - start) / len(group)
         state(f"{name}: measuring")
+        people = []
         for k, one in enumerate(group):
             result = jax.tree.map(lambda leaf, k=k: leaf[k], results)
-            found.append(as_fitted(body, one, result, folds, seconds))
+            people.append(as_fitted(body, one, result, folds, seconds))
+        arrays = people_arrays(people, scene)
+        with user_errors():
+            run.keep(number, arrays)
+        found += people
+        told += [] if scene is None else [scene]
     return found, told
 
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from spt_jax.commands.terminal import State, measurable
+from spt_jax.commands.terminal import State, measurable, user_errors
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from spt_jax.body import BodyModel
+    from spt_jax.commands.unfinished import UnfinishedRun
     from spt_jax.report import IntersectionReport
     from spt_jax.untangle.pose import Folds
 
@@ -54,6 +55,15 @@ class Frame:
         return re.sub(r"[^\w.-]+", "_", self.name).lstrip(".") or "frame"
 
 
+def made_from(motion: Motion) -> list[tuple[str, list[Any]]]:
+    """The name of each frame, and all that its result is made from."""
+    rows = (motion.shape, motion.translation)
+    return [
+        (name, [name, motion.pose[k], *(None if row is None else row[k] for row in rows)])
+        for k, name in enumerate(motion.names)
+    ]
+
+
 def untangle_frames(
     body: "BodyModel",
     motion: Motion,
@@ -63,8 +73,16 @@ def untangle_frames(
     folds: "Folds",
     fold_distance: float | None = None,
     state: State,
+    run: "UnfinishedRun | None" = None,
+    keep_vertices: bool = True,
 ) -> list[Frame]:
-    """Report on each frame, untangle it, and report again; folds that stay are left out."""
+    """Report on each frame, untangle it, and report again; folds that stay are left out.
+
+    Args:
+        run: keeps each frame as it is done, and has those that were done before.
+        keep_vertices: whether it keeps the vertices too; where not, those frames have none.
+    """
+    from spt_jax.commands.kept import frame_arrays, frame_of
     from spt_jax.exclusions import as_fold_surface
     from spt_jax.report import intersection_report
     from spt_jax.untangle.pose import untangle_pose
@@ -74,6 +92,10 @@ def untangle_frames(
     frames = []
     for k, name in enumerate(motion.names):
         state(name, done=k)
+        kept = None if run is None else run.found(k)
+        if kept is not None:
+            frames.append(frame_of(kept))
+            continue
         start = time.perf_counter()
         shape = None if motion.shape is None else motion.shape[k]
         translation = None if motion.translation is None else motion.translation[k]
@@ -113,6 +135,10 @@ def untangle_frames(
                 reason=result.reason,
             )
         )
+        if run is not None:
+            arrays = frame_arrays(frames[-1], vertices=keep_vertices)
+            with user_errors():
+                run.keep(k, arrays)
     return frames
 
 
@@ -123,7 +149,7 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
 
     # 80 columns have to do where the output is no terminal.
     table = Table(header_style="bold", padding=0, collapse_padding=True)
-    table.add_column("frame", no_wrap=True)
+    table.add_column("frame", overflow="fold", min_width=6)
     headings = (
         "ratio\nbefore",
         "\nafter",
@@ -190,7 +216,7 @@ def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -
     """What report.json holds."""
     return {
         "command": command,
-        "versions": _versions(),
+        "versions": versions(),
         "settings": settings,
         "units": {"length": "m", "volume": "m^3", "time": "s", "angle": "rad"},
         "frames": [
@@ -245,7 +271,8 @@ def _file_names(frames: Sequence[Frame]) -> list[str]:
     return [name if names.count(name) == 1 else f"{name}_{k}" for k, name in enumerate(names)]
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of Python, of this package and of those that its numbers depend on."""
     import platform
 
     found = {"python": platform.python_version(), "platform": platform.platform()}

@@ -3,6 +3,7 @@
 import json as json_format
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -27,13 +28,15 @@ def untangle(
     fold_distance: float | None = None,
     meshes: bool = False,
     rays: int | Literal["auto"] = "auto",
+    anew: bool = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Free the poses of an .npz file from self-intersections, frame by frame, or one mesh file.
 
     Takes AMASS files, parameters of SMPL, SMPL-H and SMPL-X, and files that this command wrote.
-    Writes poses.npz (AMASS layout, in the body's joints) and report.json.
+    Writes poses.npz (AMASS layout, in the body's joints) and report.json. Each frame that is done
+    is kept in OUT/unfinished until all are: a run that was ended goes on with the same command.
 
     Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
     in the same format; the exit code is 1 if something still intersects or overlaps.
@@ -54,6 +57,7 @@ def untangle(
         meshes: write a .glb of each frame before and after, coloured by class.
         rays: "auto", or rays along the longer side of each of the three beams; the search uses
             half as many.
+        anew: throw away what is done of an unfinished run in the folder.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
@@ -64,6 +68,7 @@ def untangle(
                 body=body != "anny",
                 folds=folds != "ignore",
                 fold_distance=fold_distance is not None,
+                anew=anew,
             )
         return untangle_mesh_file(poses, out, meshes=meshes, rays=rays, json=json, quiet=quiet)
     from spt_jax.arguments import as_rays
@@ -84,41 +89,43 @@ def untangle(
             as_report,
             before_after_table,
             left_out,
+            made_from,
             summary,
             untangle_frames,
             write_meshes,
             write_motion,
         )
+        from spt_jax.commands.unfinished import UnfinishedRun, manifest_of
 
         with user_errors():
             model = load_body(body, num_shape=_num_shape(given))
         motion, notes = _motion(given, rows, model, body)
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
-        done = untangle_frames(
-            model,
-            motion,
-            rays=rays,
-            directions=3,
-            folds=folds,
-            fold_distance=fold_distance,
-            state=state,
-        )
-        state("writing", done=len(rows))
-        settings = {
-            "poses": str(poses),
-            "body": body,
+        options = {
             "rays": rays,
             "directions": 3,
             "folds": folds,
             "fold_distance": fold_distance,
         }
-        report = as_report("untangle", done, settings)
         with user_errors():
-            report["meshes"] = write_meshes(folder, done, model.faces, (".glb",)) if meshes else []
-            report["notes"] = notes
-            write_motion(folder / "poses.npz", done, motion)
-            write_json(folder / "report.json", report)
+            manifest = manifest_of(
+                "untangle", options | {"meshes": meshes}, model, made_from(motion)
+            )
+            run = UnfinishedRun(folder, manifest, say=partial(show, err_console(quiet)), anew=anew)
+        with run:
+            done = untangle_frames(
+                model, motion, **options, state=state, run=run, keep_vertices=meshes
+            )
+            state("writing", done=len(rows))
+            report = as_report("untangle", done, {"poses": str(poses), "body": body, **options})
+            with user_errors():
+                written = write_meshes(folder, done, model.faces, (".glb",)) if meshes else []
+                report["meshes"] = written
+                report["notes"] = notes
+                write_motion(folder / "poses.npz", done, motion)
+                write_json(folder / "report.json", report)
+                run.finish()
     if json:
         print(json_format.dumps(report, indent=2))
         return 0
