@@ -1,5 +1,6 @@
 """Output files that are whole or absent, in folders that are checked first."""
 
+import errno
 import json
 import os
 import secrets
@@ -11,6 +12,9 @@ from typing import Any
 
 import numpy as np
 from jax import Array
+
+# What writing meets where a disk, a quota or the largest size of a file is reached, or it breaks.
+_FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 def ensure_folder(path: str | os.PathLike[str]) -> Path:
@@ -44,7 +48,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         path: where the file is to stand; its folder must exist.
 
     Raises:
-        OSError: the folder is missing or cannot be written, or `path` is itself a folder.
+        OSError: the folder is missing, full or cannot be written, or `path` is itself a folder.
 
     Example:
         >>> import tempfile
@@ -66,8 +70,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno in _FULL:
+            raise OSError(
+                f"out must have room for {str(target)!r}: got {error.strerror}; make room, or "
+                "choose another folder"
+            ) from error
         raise
 
 

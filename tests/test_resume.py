@@ -261,3 +261,18 @@ def test_a_killed_process_leaves_what_was_done(tmp_path, monkeypatch):
         assert main([*words, folder]) == 0
         assert counted.calls == calls
     assert contents(Path(out)) == contents(Path(whole))
+
+
+def test_a_full_disk_is_named_and_leaves_nothing_half_written(tmp_path):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with UnfinishedRun(tmp_path, {}, say=print) as run:
+        run.keep(0, {"x": np.zeros(3)})
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+        try:
+            with pytest.raises(OSError, match=r"out must have room for '.*000001\.npz': got File"):
+                run.keep(1, {"x": np.zeros(10_000)})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        names = {path.name for path in run.folder.iterdir()} - {"lock"}
+        assert names == {"000000.npz", "manifest.json"}
