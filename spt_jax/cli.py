@@ -21,8 +21,9 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
     0: done. 1: `check` found a self-intersection, `untangle` left one in a mesh, or `fit` could not
-    fit somebody or put somebody where no photograph could show them. 2: the input or the output folder is at fault, or a surface is none that could be
-    measured, said in one line on the standard error stream. 130: interrupted.
+    fit somebody or put somebody where no photograph could show them. 2: the input or the output
+    folder is at fault, or a surface is none that could be measured, said in one line on the
+    standard error stream. 130: interrupted.
 
     Args:
         args: the words after `spt-jax`; those of the process if None.
