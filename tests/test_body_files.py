@@ -192,7 +192,7 @@ def test_truncated_files_are_refused_by_name(tmp_path, rng, monkeypatch, suffix,
         write_official_pkl(path, synthetic_smpl(rng), monkeypatch)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match=rf"model\.{suffix} cannot be read.*truncated or damaged"):
+    with pytest.raises(ValueError, match=rf"model\.{suffix}.*truncated or damaged"):
         load_body(path)
 
 
@@ -207,7 +207,7 @@ def test_a_missing_array_and_a_wrong_shape_are_named(tmp_path, rng, key):
         with pytest.raises(ValueError, match=rf"model\.npz lacks {key};"):
             load_body(path)
     np.savez(path, **(smpl | {key: smpl[key][..., None]}))
-    with pytest.raises(ValueError, match="must be numbers of shape"):
+    with pytest.raises(ValueError, match="must be real numbers of shape"):
         load_body(path)
 
 
@@ -291,3 +291,82 @@ def test_dtype_of_the_model(dtype):
     if dtype == np.float32:
         with pytest.raises(ValueError, match="jax_enable_x64"):
             load_body(dtype="float64")
+
+
+def _damaged(smpl):
+    """By what a message must say: the same model with one array damaged."""
+
+    def at(name, place, value, kind=None):
+        array = smpl[name].astype(kind or smpl[name].dtype)
+        array[place] = value
+        return {name: array}
+
+    weights = smpl["weights"].copy()
+    weights[3, :2] += [-0.25, 0.25]
+    return {
+        "f in .* must hold whole numbers: got 1.5": at("f", (0, 0), 1.5, float),
+        "f in .* must index into v_template: got indices -1 to": at("f", (0, 0), -1, np.int64),
+        "f in .* beyond all indices": at("f", (0, 0), 1e30, float),
+        "kintree_table in .* whole numbers": at("kintree_table", (0, 1), 0.5, float),
+        "weights in .* must not be negative: got -": {"weights": weights},
+        r"weights in .* must sum to 1 .*got 1\.\d+ for vertex 2": at("weights", (2, 5), 0.9),
+        "weights in .* must be real numbers.*complex": {"weights": smpl["weights"] * 1j},
+        r"J_regressor in .* must sum to 1 .*got [23]\.\d+ for joint 4": at(
+            "J_regressor", (4, 0), 2.0
+        ),
+        r"posedirs in .* must be finite: got 1 NaN": at("posedirs", (0, 0, 0), np.nan),
+        r"shapedirs in .* must be finite": at("shapedirs", (0, 0, 0), np.inf),
+        r"v_template in .* must be within 1000 of zero.*got 1e\+300": at(
+            "v_template", (0, 0), 1e300
+        ),
+        r"posedirs in .* must be within": at("posedirs", (0, 0, 0), -1e30),
+    }
+
+
+@pytest.mark.parametrize("message", list(_damaged(synthetic_smpl(np.random.default_rng(0)))))
+def test_damaged_models_are_refused_by_their_array(tmp_path, message):
+    smpl = synthetic_smpl(np.random.default_rng(0))
+    np.savez(tmp_path / "model.npz", **(smpl | _damaged(smpl)[message]))
+    with pytest.raises(ValueError, match=message):
+        load_body(tmp_path / "model.npz")
+
+
+def test_indices_stored_as_floats_are_read(tmp_path, rng):
+    smpl = synthetic_smpl(rng)
+    np.savez(tmp_path / "model.npz", **(smpl | {"f": smpl["f"].astype(np.float32)}))
+    np.testing.assert_array_equal(load_body(tmp_path / "model.npz").faces, smpl["f"])
+
+
+def _pickled(rng, **changed):
+    return pickle.dumps(synthetic_smpl(rng) | changed, 4)
+
+
+def test_sizes_that_a_pickle_announces_are_not_believed(tmp_path, rng):
+    path = tmp_path / "model.pkl"
+    sparse = scipy.sparse.csc_matrix(np.eye(3))
+    nested = [0.0] * 10
+    for _ in range(12):
+        nested = [nested] * 10
+    huge, lying = scipy.sparse.csc_matrix((2, 2)), scipy.sparse.csc_matrix(np.eye(3))
+    huge._shape = (24, 10**13)
+    lying.indptr = np.array([0, 10**12, 10**12, 3])
+    header = b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\n"
+    for content, message in (
+        (
+            _pickled(rng, J_regressor=huge),
+            "J_regressor .*a sparse matrix of shape .24, 1",
+        ),
+        (_pickled(rng, J_regressor=lying), "J_regressor in .* other entries than it has"),
+        (_pickled(rng, v_template=nested), "v_template in .* more entries than the limit"),
+        (header + b"(M\xff\xffM\xff\xfftU\x01b\x87R.", "rebuilt from nothing: got an announced"),
+        (b"\x80\x02}r\xff\xff\xff\x7f.", "its reference 1 the number 2147483647"),
+        (b"\x80\x04\x8e" + b"\xff" * 7 + b"\x0f" + b"x.", "model.pkl cannot be read"),
+        (b"\x80\x04\x95" + b"\xff" * 7 + b"\x0f" + b"}.", "model.pkl cannot be read"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            load_body(path)
+    assert plain(sparse) is sparse
+    path.write_bytes(_pickled(rng))
+    with pytest.raises(ValueError, match=r"model file .*model\.pkl' must not take more than 99"):
+        load_body(path, max_bytes=99)

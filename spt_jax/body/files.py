@@ -4,19 +4,23 @@ import os
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import DTypeLike
 
+from spt_jax.file_limits import as_file, file_errors, read_bytes, read_npz
+
 from .model import BodyModel
-from .pickles import plain, read_pickle
+from .pickles import dense_array, read_pickle
 from .poses import SMPL_LAYOUTS
 
 _KEYS = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 # SMPL-X keeps expressions behind the shape components: 300 + 100, or 10 + 10 in its small files.
 _SMPLX_SHAPE = {400: 300, 20: 10}
+# What a model's number may be at most: no vertex is a kilometre from the pelvis.
+_LARGEST = 1e3
+_MOST_ROUNDING = 1e-3  # of weights, which some files store as float16
 
 
 def load_body(
@@ -24,6 +28,7 @@ def load_body(
     *,
     num_shape: int | None = 10,
     dtype: DTypeLike | None = None,
+    max_bytes: int | None = None,
 ) -> BodyModel:
     """A body model: the embedded one, or one from a file of the SMPL family.
 
@@ -40,17 +45,20 @@ def load_body(
         num_shape: how many shape components to keep, at most; None keeps all (SMPL-X has 300).
         dtype: dtype of the model's arrays; None means JAX's default. A call computes in the dtype
             of its pose whatever this is.
+        max_bytes: what a file and its arrays may take; 1 GiB where None.
 
     Returns:
         A BodyModel.
 
     Raises:
         FileNotFoundError: there is no such file.
+        OSError: the file cannot be read.
         TypeError: `dtype` is not a floating-point dtype.
         ValueError: the suffix is unknown; the file is damaged, lacks an array, or has one of the
-            wrong shape or with impossible values; a pickle names something that is not admitted
-            (RefusedPickleError); `num_shape` is negative; or `dtype` is float64 without
-            jax_enable_x64.
+            wrong shape or with impossible values (NaN, negative weights, weights that do not sum to
+            1, vertices beyond a kilometre); it is larger than the limit; a pickle names something
+            that is not admitted (RefusedPickleError); `num_shape` is negative; or `dtype` is
+            float64 without jax_enable_x64.
 
     Example:
         >>> from spt_jax.body import load_body
@@ -68,10 +76,17 @@ def load_body(
         raise ValueError(
             f'source must be "anny" or the path to an .npz or .pkl file: got {os.fspath(source)!r}.'
         )
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"there is no body model file at {path}; check the path.")
-    arrays = _read_npz(path) if path.suffix == ".npz" else _read_pkl(path)
-    return _from_smpl(arrays, path, num_shape, kind)
+    as_file(path, "body model file")
+    with file_errors("body model file", path):
+        if path.suffix == ".npz":
+            arrays: Mapping[str, np.ndarray] = read_npz(
+                path, {*_KEYS, "posedirs"}.__contains__, "body model file", max_bytes=max_bytes
+            ).arrays
+        else:
+            arrays = _read_pkl(path, max_bytes)
+        return _from_smpl(arrays, path, num_shape, kind)
 
 
 def _model_dtype(dtype: DTypeLike | None) -> np.dtype:
@@ -107,54 +122,14 @@ def _embedded_body(num_shape: int | None, dtype: np.dtype) -> BodyModel:
     )
 
 
-def _read_npz(path: Path) -> dict[str, Any]:
-    try:
-        # Opened here, because NumPy leaves the file open where the archive is damaged.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            if not isinstance(data, np.lib.npyio.NpzFile):
-                raise ValueError("it holds one array, not an archive of named arrays")
-            return {
-                name: _read_member(data, name, path)
-                for name in (*_KEYS, "posedirs")
-                if name in data.files
-            }
-    except _ObjectArrayError:
-        raise
-    except Exception as error:
-        raise ValueError(
-            f"{path} cannot be read as .npz: {type(error).__name__}: {error}; it is truncated or "
-            "damaged: download it again."
-        ) from error
-
-
-class _ObjectArrayError(ValueError):
-    pass
-
-
-def _read_member(data, name: str, path: Path) -> np.ndarray:
-    with data.zip.open(f"{name}.npy") as member:
-        version = np.lib.format.read_magic(member)
-        read = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        if read(member)[2].hasobject:
-            raise _ObjectArrayError(
-                f"{name} in {path} is an object array, a pickle inside the .npz, which is not "
-                "read; store it as a dense array of numbers, or load the official .pkl."
-            )
-    return data[name]
-
-
-def _read_pkl(path: Path) -> dict[str, Any]:
-    values = read_pickle(path)
+def _read_pkl(path: Path, max_bytes: int | None) -> dict[str, np.ndarray]:
+    values = read_pickle(path, read_bytes(path, "body model file", max_bytes=max_bytes))
     arrays = {}
     for name in (*_KEYS, "posedirs"):
         if name not in values:
             continue
         try:
-            arrays[name] = np.asarray(plain(values[name]))
+            arrays[name] = dense_array(values[name], max_bytes)
         except Exception as error:
             raise ValueError(
                 f"{name} in {path} cannot be turned into an array: {type(error).__name__}: "
@@ -193,19 +168,15 @@ def _from_smpl(
             f"{path} must have 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints: got {joints}."
         )
 
-    faces = arrays["f"].astype(np.int64)
+    faces = _whole_numbers("f", arrays["f"], path)
+    tree = _whole_numbers("kintree_table", tree, path)
     if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
         raise ValueError(
             f"f in {path} must index into v_template: got indices {faces.min()} to {faces.max()} "
             f"for {vertices} vertices; indices are 0-based."
         )
-    totals = arrays["weights"].sum(axis=1)
-    if totals.size and np.abs(totals - 1).max() > 1e-3:
-        worst = int(np.abs(totals - 1).argmax())
-        raise ValueError(
-            f"weights in {path} must sum to 1 for each vertex: got {totals[worst]:.4f} for vertex "
-            f"{worst}; divide each row by its sum."
-        )
+    _check_weights("weights", arrays["weights"], path)
+    _check_regressor(arrays["J_regressor"], path)
     shapes = arrays["shapedirs"].astype(np.float64)
     if joints == 55:
         shapes = shapes[..., : _SMPLX_SHAPE.get(shapes.shape[-1], shapes.shape[-1])]
@@ -230,16 +201,65 @@ def _check_shape(name: str, array: np.ndarray, shape: tuple, path: Path) -> None
     fits = array.ndim == len(shape) and all(
         want is None or want == have for want, have in zip(shape, array.shape, strict=True)
     )
-    if not fits or not np.issubdtype(array.dtype, np.number):
+    if not fits or array.dtype.kind not in "fiu":
         wanted = ", ".join("any" if want is None else str(want) for want in shape)
         raise ValueError(
-            f"{name} in {path} must be numbers of shape ({wanted}): got dtype {array.dtype} and "
-            f"shape {array.shape}; the file is damaged, or not an SMPL model."
+            f"{name} in {path} must be real numbers of shape ({wanted}): got dtype {array.dtype} "
+            f"and shape {array.shape}; the file is damaged, or not an SMPL model."
         )
     if not np.isfinite(array).all():
         raise ValueError(
             f"{name} in {path} must be finite: got {np.count_nonzero(~np.isfinite(array))} NaN or "
             "infinite entries; the file is damaged: download it again."
+        )
+    # Indices are whole numbers of any size; the root's parent is 4294967295.
+    if name not in ("f", "kintree_table") and array.size:
+        largest = float(np.abs(array.astype(np.float64)).max())
+        if largest > _LARGEST:
+            raise ValueError(
+                f"{name} in {path} must be within {_LARGEST:g} of zero, in metres or as a share: "
+                f"got {largest:g}; the file is damaged, or not an SMPL model."
+            )
+
+
+def _whole_numbers(name: str, array: np.ndarray, path: Path) -> np.ndarray:
+    """Indices as int64; some files store them as floats, which are not to be cut off."""
+    if array.dtype.kind == "f" and not (array == np.floor(array)).all():
+        wrong = array[array != np.floor(array)]
+        raise ValueError(
+            f"{name} in {path} must hold whole numbers: got {wrong.flat[0]:g}; the file is damaged."
+        )
+    if array.size and float(np.abs(array.astype(np.float64)).max()) > 2**62:
+        raise ValueError(f"{name} in {path} holds numbers beyond all indices; it is damaged.")
+    return array.astype(np.int64)
+
+
+def _check_weights(name: str, weights: np.ndarray, path: Path) -> None:
+    if not weights.size:
+        return
+    if weights.min() < -_MOST_ROUNDING:
+        row, column = np.unravel_index(int(weights.argmin()), weights.shape)
+        raise ValueError(
+            f"{name} in {path} must not be negative: got {weights.min():.4g} for vertex {row} and "
+            f"joint {column}; the file is damaged."
+        )
+    totals = weights.sum(axis=1, dtype=np.float64)
+    if np.abs(totals - 1).max() > _MOST_ROUNDING:
+        worst = int(np.abs(totals - 1).argmax())
+        raise ValueError(
+            f"{name} in {path} must sum to 1 for each vertex: got {totals[worst]:.4f} for vertex "
+            f"{worst}; divide each row by its sum."
+        )
+
+
+def _check_regressor(regressor: np.ndarray, path: Path) -> None:
+    # Its entries may be negative, but a joint that is no mean of vertices does not move with them.
+    totals = regressor.sum(axis=1, dtype=np.float64)
+    if totals.size and np.abs(totals - 1).max() > 10 * _MOST_ROUNDING:
+        worst = int(np.abs(totals - 1).argmax())
+        raise ValueError(
+            f"J_regressor in {path} must sum to 1 for each joint: got {totals[worst]:.4f} for "
+            f"joint {worst}; the file is damaged."
         )
 
 

@@ -4,17 +4,26 @@ A pickle is a program: it can call whatever it can name. This reader knows a sho
 listed below one by one, answers each with a harmless function or a stand-in class of its own, and
 refuses every other name before anything of it is imported, let alone called. Neither chumpy nor
 SciPy is imported: their arrays are read from the state that the pickle stores.
+
+Nor are the sizes believed that a pickle announces: what would be allocated by them alone, a table
+of references, an empty array, a sparse matrix made dense, is compared with the bytes that there are
+and with a limit.
 """
 
 import codecs
 import io
+import math
 import os
 import pickle
+import pickletools
 from collections import OrderedDict
 from typing import Any
 
 import numpy as np
 from numpy._core import multiarray
+
+_MAX_BYTES = 2**30
+_LARGEST_SCALAR = 64
 
 
 class _StandIn:
@@ -33,8 +42,8 @@ class _Chumpy(_StandIn):
 
     __slots__ = ()
 
-    def as_array(self) -> np.ndarray:
-        return np.asarray(plain(self.state["x"]))
+    def as_array(self, max_bytes: int) -> np.ndarray:
+        return _dense(plain(self.state["x"], max_bytes), max_bytes)
 
 
 class _ChumpySelect(_StandIn):
@@ -42,9 +51,9 @@ class _ChumpySelect(_StandIn):
 
     __slots__ = ()
 
-    def as_array(self) -> np.ndarray:
-        source = np.asarray(plain(self.state["a"]))
-        picked = source.ravel()[np.asarray(plain(self.state["idxs"]))]
+    def as_array(self, max_bytes: int) -> np.ndarray:
+        source = _dense(plain(self.state["a"], max_bytes), max_bytes)
+        picked = source.ravel()[_dense(plain(self.state["idxs"], max_bytes), max_bytes)]
         return picked.reshape(self.state["preferred_shape"])
 
 
@@ -53,30 +62,39 @@ class _Sparse(_StandIn):
 
     __slots__ = ()
 
-    def as_array(self) -> np.ndarray:
+    def as_array(self, max_bytes: int) -> np.ndarray:
         state = self.state
-        dense = np.zeros(state["_shape"], np.asarray(state["data"]).dtype)
-        np.add.at(dense, self._entries(state), state["data"])
+        shape, data = tuple(map(int, state["_shape"])), np.asarray(state["data"])
+        if 8 * max(math.prod(shape), *shape) > max_bytes:
+            raise ValueError(f"it announces a sparse matrix of shape {shape}, beyond the limit")
+        dense = np.zeros(shape, data.dtype)
+        np.add.at(dense, self._entries(state), data)
         return dense
 
     def _entries(self, state) -> tuple[np.ndarray, np.ndarray]:
         raise NotImplementedError
 
 
+def _expanded(state: dict[str, Any], length: int) -> np.ndarray:
+    """The row, or column, of each entry, from where each row's entries end."""
+    counts: np.ndarray = np.diff(np.asarray(state["indptr"], np.int64))
+    if len(counts) != length or (counts < 0).any() or counts.sum() != len(state["indices"]):
+        raise ValueError("a sparse matrix says to have other entries than it has")
+    return np.repeat(np.arange(length), counts)
+
+
 class _SparseColumns(_Sparse):
     __slots__ = ()
 
     def _entries(self, state):
-        columns = np.repeat(np.arange(state["_shape"][1]), np.diff(state["indptr"]))
-        return state["indices"], columns
+        return state["indices"], _expanded(state, int(state["_shape"][1]))
 
 
 class _SparseRows(_Sparse):
     __slots__ = ()
 
     def _entries(self, state):
-        rows = np.repeat(np.arange(state["_shape"][0]), np.diff(state["indptr"]))
-        return rows, state["indices"]
+        return _expanded(state, int(state["_shape"][0])), state["indices"]
 
 
 class _SparseCoordinates(_Sparse):
@@ -102,6 +120,8 @@ class _Reconstruct(_Function):
     def __call__(self, subtype, shape, dtype):
         if subtype is not np.ndarray:
             raise TypeError(f"arrays are rebuilt as numpy.ndarray only, not as {subtype!r}")
+        if tuple(shape) != (0,):  # as NumPy writes it: size and content follow
+            raise ValueError(f"arrays are rebuilt from nothing: got an announced shape {shape}")
         return multiarray._reconstruct(np.ndarray, shape, dtype)
 
 
@@ -114,6 +134,8 @@ class _Scalar(_Function):
         if not isinstance(dtype, np.dtype) or dtype.hasobject or dtype.names:
             raise TypeError(f"NumPy scalars must be numbers or strings, not {dtype!r}")
         if value is None:
+            if dtype.itemsize > _LARGEST_SCALAR:
+                raise ValueError(f"a scalar announces {dtype.itemsize:,} bytes")
             return np.zeros((), dtype)[()]
         raw = value.encode("latin1") if isinstance(value, str) else bytes(value)
         return np.frombuffer(raw, dtype, count=1)[0]
@@ -195,20 +217,71 @@ class _Reader(pickle.Unpickler):
             ) from None
 
 
-def plain(value: Any) -> Any:
-    """The dense NumPy array of a stand-in; any other value as it is."""
+def plain(value: Any, max_bytes: int = _MAX_BYTES) -> Any:
+    """The dense NumPy array of a stand-in; any other value as it is.
+
+    Args:
+        value: what a pickle holds.
+        max_bytes: the most that a sparse matrix may take once it is dense.
+
+    Raises:
+        ValueError: it takes more, or contradicts itself.
+    """
     if isinstance(value, _StandIn):
-        return value.as_array()  # pyright: ignore[reportAttributeAccessIssue]
+        return value.as_array(max_bytes)  # pyright: ignore[reportAttributeAccessIssue]
     return value
 
 
-def read_pickle(path: str | os.PathLike[str]) -> dict[str, Any]:
+def _dense(value: Any, max_bytes: int) -> np.ndarray:
+    """A value as an array, once its lists hold no more entries than the limit lets in.
+
+    A list that holds another one ten times, which holds a third ten times, takes a few bytes in a
+    pickle and any number of them as an array.
+    """
+    left = [value]
+    entries = 0
+    while left:
+        item = left.pop()
+        if isinstance(item, (list, tuple)):
+            entries += len(item)
+            if 8 * entries > max_bytes:
+                raise ValueError("its lists hold more entries than the limit")
+            left += [inner for inner in item if isinstance(inner, (list, tuple))]
+    return np.asarray(value)
+
+
+def dense_array(value: Any, max_bytes: int | None = None) -> np.ndarray:
+    """Whatever a pickle holds as a dense array: a stand-in, an array, or nested lists.
+
+    Args:
+        value: what the pickle holds.
+        max_bytes: the limit; 1 GiB where None.
+
+    Raises:
+        ValueError, TypeError, KeyError: it is none, or larger.
+    """
+    limit = _MAX_BYTES if max_bytes is None else max_bytes
+    return _dense(plain(value, limit), limit)
+
+
+def _check_memo(content: bytes) -> None:
+    """Raise where a pickle numbers its references so that the table of them would be huge."""
+    numbered = 0
+    for opcode, argument, _ in pickletools.genops(content):
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            numbered += 1
+            if int(str(argument)) > 4 * numbered + 1000:
+                raise ValueError(f"it gives its reference {numbered} the number {argument}")
+
+
+def read_pickle(path: str | os.PathLike[str], content: bytes | None = None) -> dict[str, Any]:
     """The dictionary in a pickle of plain data, the way Python 2 or 3 wrote it.
 
     Chumpy arrays and sparse matrices come back as objects that `plain` turns into dense arrays.
 
     Args:
         path: the file.
+        content: the file's bytes, where they have been read already.
 
     Returns:
         The dictionary.
@@ -231,11 +304,13 @@ def read_pickle(path: str | os.PathLike[str]) -> dict[str, Any]:
         ...         "asks for builtins.print" in str(error)
         True
     """
-    with open(path, "rb") as file:
-        content = io.BytesIO(file.read())
+    if content is None:
+        with open(path, "rb") as file:
+            content = file.read()
     try:
+        _check_memo(content)
         # Latin-1 keeps the bytes of Python 2's strings, in which its arrays are stored.
-        value = _Reader(content, encoding="latin1").load()
+        value = _Reader(io.BytesIO(content), encoding="latin1").load()
     except RefusedPickleError as error:
         raise RefusedPickleError(f"{os.fspath(path)}: {error}") from None
     except Exception as error:

@@ -1,8 +1,6 @@
 """Pose files: the .npz layouts of AMASS, SMPL, SMPL-H and SMPL-X, and this project's own."""
 
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from spt_jax.file_limits import read_npz
 from spt_jax.output_files import atomic_write
 
 JOINT_COUNTS = (22, 24, 52, 55)
@@ -22,6 +21,10 @@ _POSES = ("poses", "pose")
 _SHAPES = ("betas", "shape")
 _TRANSLATIONS = ("trans", "transl", "translation")
 _KEYS = {*_POSES, *_SHAPES, *_TRANSLATIONS, *_HANDS, *_HEAD, "global_orient", "body_pose", "name"}
+# Beyond these a number is none of a body's: angles in radians, however often they wind; shape
+# coefficients; and positions in metres, or in millimetres.
+_MOST_RADIANS = 1e4
+_MOST = {**dict.fromkeys(_SHAPES, 1e4), **dict.fromkeys(_TRANSLATIONS, 1e9)}
 _ACCEPTED = (
     "poses or pose (N frames of 22, 24, 52 or 55 axis-angle rows), or global_orient with body_pose"
 )
@@ -38,7 +41,7 @@ class PoseFile(NamedTuple):
     names: list[str]
 
 
-def read_poses(path: str | os.PathLike[str]) -> PoseFile:
+def read_poses(path: str | os.PathLike[str], *, max_bytes: int | None = None) -> PoseFile:
     """Return the poses of an .npz file, with shape, translation and names where it has them.
 
     Layouts, told apart by their keys:
@@ -53,11 +56,14 @@ def read_poses(path: str | os.PathLike[str]) -> PoseFile:
 
     Args:
         path: the file.
+        max_bytes: what its arrays may take once unpacked; 1 GiB where None.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not an .npz file, pickled arrays, missing keys, wrong sizes, or NaN or infinity;
-            the message names the file, the key, the shape seen and what is accepted.
+        OSError: it cannot be read.
+        ValueError: not an .npz file, pickled arrays, missing keys, wrong sizes, NaN or infinity,
+            angles or positions beyond all bodies, or more bytes than the limit; the message names
+            the file, the key, what was seen and what is accepted.
 
     Example:
         >>> import pathlib, tempfile
@@ -71,14 +77,9 @@ def read_poses(path: str | os.PathLike[str]) -> PoseFile:
         ((5, 52, 3), (5, 3), None)
     """
     file = Path(path)
-    if not file.exists():
-        raise FileNotFoundError(f"pose file must exist: got {str(path)!r}; check the spelling")
-    if not zipfile.is_zipfile(file):  # np.load would take it for a pickle, and say only that
-        raise ValueError(f"pose file must be an .npz archive: got {str(path)!r}")
-    with np.load(file, allow_pickle=False) as archive:
-        # Other keys are left alone: some AMASS releases pickle the gender.
-        arrays = {key: _load(archive, key, file) for key in archive.files if key in _KEYS}
-        keys = sorted(archive.files)
+    # Other keys are left alone: some AMASS releases pickle the gender.
+    found = read_npz(file, _KEYS.__contains__, "pose file", max_bytes=max_bytes)
+    arrays, keys = found.arrays, sorted(found.names)
     key = next((key for key in _POSES if key in arrays), None)
     if key is not None:
         pose = _frames(file, arrays, key, JOINT_COUNTS)
@@ -143,16 +144,6 @@ def write_poses(
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 
-def _load(archive: Mapping[str, np.ndarray], key: str, file: Path) -> np.ndarray:
-    try:
-        return archive[key]
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
-            f"pose file must hold plain arrays: got {str(file)!r} with {key!r} ({error}); "
-            "save it again without objects"
-        ) from error
-
-
 def _finite(file: Path, arrays: Mapping[str, np.ndarray], key: str) -> np.ndarray:
     values = arrays[key]
     if values.dtype.kind not in "fiu":
@@ -160,7 +151,16 @@ def _finite(file: Path, arrays: Mapping[str, np.ndarray], key: str) -> np.ndarra
     if not np.isfinite(values).all():
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
         raise ValueError(f"{key} must be finite: got {values[place]} at {place} in {str(file)!r}")
-    return values.astype(np.float64)
+    most = _MOST.get(key, _MOST_RADIANS)
+    with np.errstate(over="ignore"):
+        numbers = values.astype(np.float64)
+    if not (np.abs(numbers) <= most).all():
+        place = tuple(int(i) for i in np.argwhere(~(np.abs(numbers) <= most))[0])
+        raise ValueError(
+            f"{key} must be within {most:g} of zero: got {values[place]} at {place} in "
+            f"{str(file)!r}; it is damaged, or in another unit"
+        )
+    return numbers
 
 
 def _frames(
@@ -250,4 +250,7 @@ def _names(file: Path, arrays: Mapping[str, np.ndarray], frames: int) -> list[st
         raise ValueError(
             f"name must hold {frames} strings: got {names.dtype} {names.shape} in {str(file)!r}"
         )
-    return [str(name) for name in names]
+    try:
+        return [str(name) for name in names]
+    except ValueError as error:  # a number that is no letter
+        raise ValueError(f"name must hold text: got {error} in {str(file)!r}") from error

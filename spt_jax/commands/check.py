@@ -19,6 +19,7 @@ from spt_jax.commands.terminal import (
 def check(
     mesh: tyro.conf.Positional[Path],
     rays: int | Literal["auto"] = "auto",
+    max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -32,6 +33,7 @@ def check(
         mesh: the file, such as body.ply, body.obj, body.stl or body.glb.
         rays: "auto": measured exactly, without rays; or rays along the longer side of each of three
             beams.
+        max_bytes: what the file and its arrays may take; not given: 1 GiB.
         json: print the report as JSON.
         quiet: print errors alone.
     """
@@ -40,11 +42,12 @@ def check(
         "file": str(mesh),
         "error": None,
         "warning": None,
+        "notes": [],
         "mesh": None,
         "intersection": None,
     }
     try:
-        code, shown = _judge(mesh, rays, found)
+        code, shown = _judge(mesh, rays, max_bytes, found)
     except CommandError as error:
         if not json:
             raise
@@ -55,22 +58,28 @@ def check(
     else:
         for part in shown:
             console.print(part)
+        for note in found["notes"]:
+            show(err_console(quiet), f"note: {note}", "yellow")
         if found["warning"] is not None:
             show(err_console(quiet), f"warning: {found['warning']}", "yellow")
     return code
 
 
-def _judge(path: Path, rays: int | Literal["auto"], found: dict[str, Any]) -> tuple[int, list[Any]]:
+def _judge(
+    path: Path, rays: int | Literal["auto"], max_bytes: int | None, found: dict[str, Any]
+) -> tuple[int, list[Any]]:
     from dataclasses import asdict
 
     from spt_jax.arguments import as_rays
     from spt_jax.mesh_check import check_mesh
-    from spt_jax.mesh_files import read_mesh
+    from spt_jax.mesh_files import open_mesh
     from spt_jax.report import intersection_report
 
     with user_errors():
         as_rays(rays)
-        vertices, faces = read_mesh(path)
+        opened = open_mesh(path, max_bytes=max_bytes)
+    vertices, faces = opened.vertices, opened.faces
+    found["notes"] = list(opened.notes)
     checked = check_mesh(vertices, faces)
     found["mesh"] = asdict(checked)
     if not checked.ok:

@@ -30,20 +30,29 @@ _KNOWN = (*_TEXT, *_SINGLE, ".ply")
 
 
 def untangle_mesh_file(
-    path: Path, out: Path, *, meshes: bool, rays: int | Literal["auto"], json: bool, quiet: bool
+    path: Path,
+    out: Path,
+    *,
+    meshes: bool,
+    rays: int | Literal["auto"],
+    max_bytes: int | None = None,
+    json: bool,
+    quiet: bool,
 ) -> int:
     """Free one mesh; the exit code is 0 if it is free, and 1 otherwise."""
     from spt_jax.arguments import as_rays
     from spt_jax.mesh_check import check_mesh
-    from spt_jax.mesh_files import read_mesh
+    from spt_jax.mesh_files import open_mesh
     from spt_jax.output_files import ensure_folder, write_json
 
     with user_errors():
         as_rays(rays)
-        vertices, faces = read_mesh(path)
+        opened = open_mesh(path, max_bytes=max_bytes)
+        vertices, faces = opened.vertices, opened.faces
         check_mesh(vertices, faces).raise_if_unfit()
         given, suffix, notes = _as_stored(vertices, path.suffix.lower())
         folder = ensure_folder(out)
+    notes = [*opened.notes, *notes]
     for note in notes:
         show(err_console(quiet), f"note: {note}", "yellow")
     start = time.perf_counter()
@@ -68,13 +77,16 @@ def untangle_mesh_file(
         }
         with user_errors():
             report["mesh"] = f"{path.stem}_untangled{suffix}"
-            _write(folder / report["mesh"], result.vertices, faces)
+            written = opened.write(folder / report["mesh"], result.vertices)
+            report["notes"] = [*notes, *written]
             report["meshes"] = (
                 _write_coloured(folder, path.stem, given, result.vertices, faces, rays)
                 if meshes
                 else []
             )
             write_json(folder / "report.json", report)
+    for note in written:
+        show(err_console(quiet), f"note: {note}", "yellow")
     if json:
         print(json_format.dumps(report, indent=2))
     else:
@@ -110,6 +122,9 @@ def _as_stored(
     from spt_jax.mesh_files import fits_single, single_rounding
 
     rounding, notes = single_rounding(vertices), []
+    if suffix == ".gltf":
+        notes.append(".gltf files are written as .glb, all in one file")
+        suffix = ".glb"
     if suffix not in _KNOWN:
         notes.append(f"{suffix} files are read only; the mesh is written as .ply")
         suffix = ".ply"
@@ -142,32 +157,6 @@ def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
     table.add_row("triangles turned over", "", f"{result.flipped_triangles}")
     table.add_row("steps, time", "", f"{result.steps}, {seconds:.1f} s")
     return table
-
-
-def _write(path: Path, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
-    """Write a mesh so that it reads back to the bit: no digit of a freed mesh may be lost."""
-    from spt_jax.mesh_files import write_mesh
-    from spt_jax.output_files import atomic_write
-
-    if path.suffix in (".ply", ".glb"):
-        write_mesh(path, vertices, faces)
-        return
-    if path.suffix == ".stl":
-        import trimesh
-        from trimesh.exchange.stl import export_stl
-
-        content = export_stl(trimesh.Trimesh(vertices, faces, process=False))
-    elif path.suffix == ".obj":
-        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-        lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
-        content = ("\n".join(lines) + "\n").encode()
-    else:
-        lines = ["OFF", f"{len(vertices)} {len(faces)} 0"]
-        lines += [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-        lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
-        content = ("\n".join(lines) + "\n").encode()
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
 
 
 def _write_coloured(

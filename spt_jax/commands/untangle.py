@@ -29,6 +29,7 @@ def untangle(
     meshes: bool = False,
     rays: int | Literal["auto"] = "auto",
     anew: bool = False,
+    max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -58,6 +59,7 @@ def untangle(
         rays: "auto", or rays along the longer side of each of the three beams; the search uses
             half as many.
         anew: throw away what is done of an unfinished run in the folder.
+        max_bytes: how large an input file may be, and its arrays once unpacked; not given: 1 GiB.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
@@ -70,7 +72,9 @@ def untangle(
                 fold_distance=fold_distance is not None,
                 anew=anew,
             )
-        return untangle_mesh_file(poses, out, meshes=meshes, rays=rays, json=json, quiet=quiet)
+        return untangle_mesh_file(
+            poses, out, meshes=meshes, rays=rays, max_bytes=max_bytes, json=json, quiet=quiet
+        )
     from spt_jax.arguments import as_rays
     from spt_jax.body.pose_files import read_poses
     from spt_jax.exclusions import as_fold_distance
@@ -79,7 +83,7 @@ def untangle(
     with user_errors():
         as_rays(rays)
         as_fold_distance(fold_distance)
-        given = read_poses(poses)
+        given = read_poses(poses, max_bytes=max_bytes)
         rows = select_frames(given.names, frames)
         folder = ensure_folder(out)
     with progress_bar(len(rows), quiet) as state:
@@ -98,7 +102,7 @@ def untangle(
         from spt_jax.commands.unfinished import UnfinishedRun, manifest_of
 
         with user_errors():
-            model = load_body(body, num_shape=_num_shape(given))
+            model = load_body(body, num_shape=_num_shape(given), max_bytes=max_bytes)
         motion, notes = _motion(given, rows, model, body)
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
