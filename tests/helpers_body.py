@@ -170,9 +170,9 @@ def smpl_pose(rng, joints, *batch):
     return rng.normal(scale=0.7, size=(*batch, joints, 3)), SMPL_LAYOUTS[joints]
 
 
-def ball_arrays():
+def ball_arrays(subdivisions=1):
     """An SMPL file's arrays: a ball for each joint of a stick figure, all of them apart."""
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.05)
     names, parents = SMPL_LAYOUTS[24], PARENTS[24]
     joints = np.zeros((24, 3))
     for joint, parent in enumerate(parents[1:], start=1):

@@ -49,6 +49,12 @@ def port_of(view):
     return view.server.get_port()
 
 
+def unsent_bytes(view):
+    """What waits in the view for browsers to take it: the system's own buffers are full."""
+    connections = view.server._websock_server._live_connections.values()
+    return sum(connection.transport.get_write_buffer_size() for connection in connections)
+
+
 def wait_until(condition):
     end = time.monotonic() + SECONDS
     while not condition():

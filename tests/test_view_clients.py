@@ -1,12 +1,15 @@
 """Several browsers at once: two that work, one that stays away, one that floods."""
 
+import itertools
+
 import numpy as np
 import pytest
+import trimesh
 
 pytest.importorskip("viser", reason="the live view needs viser")
 
 from helpers_body import ball_arrays
-from helpers_view import Browser, served, socket_that_never_reads, wait_until
+from helpers_view import SECONDS, Browser, served, socket_that_never_reads, unsent_bytes, wait_until
 
 _SLIDER = "z (degrees)"
 
@@ -14,13 +17,13 @@ _SLIDER = "z (degrees)"
 @pytest.fixture(scope="module")
 def ball_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("clients") / "balls.npz"
-    np.savez(path, **ball_arrays())
+    np.savez(path, **ball_arrays(subdivisions=2))
     return path
 
 
 @pytest.fixture(scope="module")
 def view(ball_file):
-    with served(ball_file, patience=1.0) as running:
+    with served(ball_file, patience=2.0) as running:
         yield running
 
 
@@ -51,18 +54,34 @@ def test_two_browsers_see_what_either_does_and_one_may_leave(view):
 
 
 def test_a_browser_that_stays_away_holds_nobody_up_and_is_let_go(view):
+    values = itertools.count(1)
+
+    def move(browser):
+        value = next(values) / 4.0
+        browser.set(_SLIDER, value)
+        wait_until(lambda: abs(degrees(view) - value) < 1e-3)
+
     with Browser(view) as other, socket_that_never_reads(view):
         wait_until(lambda: len(view.server.get_clients()) == 2)
-        other.set(_SLIDER, 0.5)
-        wait_until(lambda: abs(degrees(view) - 0.5) < 1e-3)
+        move(other)
         before = buffered(view)
-        for k in range(100):  # of 24 balls each time, far more than a socket holds
-            other.set(_SLIDER, k / 2.0)
-            wait_until(lambda k=k: abs(degrees(view) - k / 2.0) < 1e-3)
+        while not unsent_bytes(view):
+            move(other)
+        for _ in range(20):
+            move(other)
         assert buffered(view) <= before + 8  # the newest of each kind
         wait_until(lambda: connections(view) == 1)
-        other.set(_SLIDER, 3.0)
-        wait_until(lambda: abs(degrees(view) - 3.0) < 1e-3)
+        move(other)
+
+
+def test_a_browser_that_stays_away_does_not_keep_the_view_from_ending(tmp_path):
+    trimesh.creation.icosphere(subdivisions=6).export(tmp_path / "ball.ply")
+    with served(tmp_path / "ball.ply") as view, socket_that_never_reads(view):
+        while not unsent_bytes(view):
+            view._do("reset", "reset")
+            assert view.worker.wait_until_idle(SECONDS)
+        view.stop_serving()
+        assert not view.server._websock_server._server_thread.is_alive()
 
 
 def test_a_flood_of_messages_leaves_one_change_waiting(view, monkeypatch):

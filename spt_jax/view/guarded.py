@@ -41,7 +41,7 @@ def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience:
         access: who is let in.
         numeric: the address to serve on, as a number.
         port: the port.
-        patience: seconds between two questions to a browser, for its answer, and for its farewell.
+        patience: seconds between two questions to a browser, and for its answer.
 
     Raises:
         ImportError: this version of viser cannot be guarded.
@@ -58,9 +58,10 @@ def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience:
         options["process_request"] = _guard(access, options.get("process_request"))
         options["process_response"] = _harden
         options["max_size"] = _LARGEST_MESSAGE
-        options["ping_interval"] = options["ping_timeout"] = options["close_timeout"] = patience
+        options["ping_interval"] = options["ping_timeout"] = patience
+        options["close_timeout"] = patience / 2
         options["logger"] = _LOGGER
-        return plain(_tolerant(handler), *arguments, **options)
+        return plain(_tolerant(handler, patience), *arguments, **options)
 
     # Without viser's banner: the command says where it serves.
     with _STARTING, contextlib.redirect_stdout(None):
@@ -85,6 +86,13 @@ def forget_what_was_removed(server: Any) -> None:
     Every file that is opened leaves ten of them.
     """
     server._run_garbage_collector()
+
+
+def drop_who_does_not_read(server: Any) -> None:
+    """End the connections that have not taken what was sent: stopping would wait for them."""
+    for connection in tuple(server._websock_server._live_connections.values()):
+        if connection.transport.get_write_buffer_size():
+            server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
 
 def stop_quietly(server: Any) -> None:
@@ -114,16 +122,32 @@ def _harden(connection: Any, request: Any, response: Any) -> None:
         response.headers[name] = value
 
 
-def _tolerant(handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def _tolerant(handler: Callable[[Any], Any], patience: float) -> Callable[[Any], Any]:
     # What is no message ends that browser's connection, not with a traceback.
     async def handle(connection: Any) -> None:
+        watch = asyncio.create_task(_drop_if_it_never_reads(connection, patience))
         try:
             await handler(connection)
         except Exception as error:
             _say(f"a browser's connection was closed: {_named(error)}")
             await connection.close(1007, "a message was not understood")
+        finally:
+            watch.cancel()
 
     return handle
+
+
+async def _drop_if_it_never_reads(connection: Any, patience: float) -> None:
+    # `websockets` 16 asks such a browser nothing: its ping waits for the message before it to be
+    # sent, which is what the browser does not take.
+    before = 0
+    while True:
+        await asyncio.sleep(patience)
+        unsent = connection.transport.get_write_buffer_size()
+        if unsent and unsent == before:
+            connection.transport.abort()
+            return
+        before = unsent
 
 
 def _report_from_loop(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -15,7 +15,13 @@ from spt_jax.mesh_check import check_mesh
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
 from spt_jax.view.freeing import untangle_scene
-from spt_jax.view.guarded import PATIENCE, forget_what_was_removed, start_guarded, stop_quietly
+from spt_jax.view.guarded import (
+    PATIENCE,
+    drop_who_does_not_read,
+    forget_what_was_removed,
+    start_guarded,
+    stop_quietly,
+)
 from spt_jax.view.panel import MEASURES, Panel
 from spt_jax.view.scene import Reading, Scene
 from spt_jax.view.stage import Stage
@@ -101,6 +107,7 @@ class View:
         """End the server; whether the work under way ended too."""
         self._stop.set()
         ended = self.worker.stop(timeout)
+        drop_who_does_not_read(self.server)
         stop_quietly(self.server)
         return ended
 
