@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 import tyro
@@ -10,6 +11,7 @@ import tyro
 from spt_jax.commands.check import check
 from spt_jax.commands.demo import demo
 from spt_jax.commands.fit import fit
+from spt_jax.commands.streams import OutputLostError, guarded_streams
 from spt_jax.commands.terminal import CommandError
 from spt_jax.commands.untangle import untangle
 from spt_jax.commands.view import view
@@ -22,12 +24,25 @@ def main(args: Sequence[str] | None = None) -> int:
 
     0: done. 1: `check` found a self-intersection, `untangle` left one in a mesh, or `fit` could not
     fit somebody or put somebody where no photograph could show them. 2: the input or the output
-    folder is at fault, or a surface is none that could be measured, said in one line on the
-    standard error stream. 130: interrupted.
+    folder is at fault, the output takes no more, or a surface is none that could be measured, said
+    in one line on the standard error stream. 130: interrupted. 141: the output is a pipe whose
+    reader has gone.
 
     Args:
         args: the words after `spt-jax`; those of the process if None.
     """
+    try:
+        with guarded_streams():
+            return _run(args)
+    except OutputLostError as error:
+        if error.closed:
+            return 141
+        with suppress(OSError):
+            print(f"spt-jax: {error}", file=sys.stderr, flush=True)
+        return 2
+
+
+def _run(args: Sequence[str] | None) -> int:
     try:
         return tyro.extras.subcommand_cli_from_dict(
             _COMMANDS,
@@ -38,6 +53,13 @@ def main(args: Sequence[str] | None = None) -> int:
         )
     except CommandError as error:
         print(f"spt-jax: {error}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(
+            "spt-jax: there is not enough memory for this; free some, or take a smaller mesh or "
+            "fewer frames",
+            file=sys.stderr,
+        )
         return 2
     except ValueError as error:
         # Imported here: not every command measures something.
