@@ -246,8 +246,9 @@ def _problems(check: MeshCheck) -> Iterable[str]:
     if n := check.boundary_edges:
         yield (
             f"{_count(n, 'boundary edge')} around {_count(check.holes, 'hole')}: the surface is "
-            "open; with trimesh: mesh.merge_vertices() if it is only split along seams, else "
-            "trimesh.repair.fill_holes(mesh)"
+            "open; with trimesh: mesh.merge_vertices(merge_tex=True, merge_norm=True) if it is "
+            "only split along seams, else trimesh.repair.fill_holes(mesh, use_fan=True), and a "
+            "mesh editor for what is left"
         )
     if n := check.misoriented_edges:
         yield (
