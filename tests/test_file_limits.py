@@ -5,11 +5,14 @@ import json
 import struct
 import tracemalloc
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from spt_jax.file_limits import TooLargeError, as_file, file_errors, read_bytes, read_json, read_npz
+from spt_jax.show.overlay import read_image
 
 
 def npy(array, shape=None, descr=None):
@@ -164,3 +167,47 @@ def test_errors_get_their_file(tmp_path):
     with pytest.raises(OSError, match=r"mesh file must be readable: got 'a.ply' \(bad disk\)"):
         with file_errors("mesh file", "a.ply"):
             raise OSError(5, "bad disk")
+
+
+def png(width, height, rows=b""):
+    """A picture of the announced size, with as many bytes as given."""
+
+    def chunk(kind, content):
+        check = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    packed = chunk(b"IDAT", zlib.compress(rows))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + packed + chunk(b"IEND", b"")
+
+
+def test_images_are_not_unpacked_beyond_the_limit(tmp_path):
+    file = tmp_path / "a.png"
+    file.write_bytes(png(3, 2, b"\0\1\2\3" * 2))
+    assert read_image(file).tolist() == [[[1] * 3, [2] * 3, [3] * 3]] * 2
+    for side in (2_000_000_000, 12_000):
+        file.write_bytes(png(side, side))
+        with pytest.raises(ValueError, match=r"a\.png"):
+            read_image(file, max_bytes=10**8)
+    with pytest.raises(TooLargeError, match=r"image .*a\.png' must not take more than 100,000,000"):
+        read_image(file, max_bytes=10**8)
+    (tmp_path / "a.eps").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+    with pytest.raises(ValueError, match=r"a photograph that opens: got .*a\.eps"):
+        read_image(tmp_path / "a.eps")
+
+
+def test_damaged_images_are_refused_by_name(tmp_path, rng):
+    picture = Image.fromarray(rng.integers(0, 255, (9, 9, 3), np.uint8))
+    for suffix in ("png", "jpg", "tif", "webp", "bmp"):
+        file = tmp_path / f"a.{suffix}"
+        picture.save(file)
+        whole = file.read_bytes()
+        for _ in range(40):
+            content = bytearray(whole)
+            for place in rng.integers(0, len(whole), 3):
+                content[place] = rng.integers(256)
+            file.write_bytes(content[: rng.integers(len(whole))] if rng.random() < 0.3 else content)
+            try:
+                assert read_image(file).ndim == 3
+            except ValueError as error:
+                assert file.name in str(error)

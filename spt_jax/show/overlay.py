@@ -1,8 +1,8 @@
 """Bodies drawn over the photograph that they were fitted to."""
 
 import os
+import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Float, Int, UInt8
 
 from spt_jax.camera import PinholeCamera
+from spt_jax.file_limits import TooLargeError, as_file, check_bytes, file_errors
 from spt_jax.keypoints.layouts import Layout
 from spt_jax.mesh_files import as_mesh_arrays
 from spt_jax.show.look import BACKGROUND, LIGHTS, MATERIAL, Picture, check_png, finished
@@ -101,31 +102,42 @@ def render_overlay(
     return finished(picture, path)
 
 
-def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "height width 3"]:
+def read_image(
+    path: str | os.PathLike[str], *, max_bytes: int | None = None
+) -> UInt8[np.ndarray, "height width 3"]:
     """A photograph as it is to be looked at: turned as its camera says, without transparency.
 
     Args:
-        path: a file of any kind that Pillow reads.
+        path: a file of any kind that Pillow reads by itself.
+        max_bytes: what its pixels may take, three bytes each; 1 GiB where None.
 
     Raises:
         ImportError: Pillow is not installed.
         FileNotFoundError: there is no such file.
-        ValueError: it is no image, or is cut or damaged.
+        OSError: the system does not let it be read.
+        ValueError: it is no image, is cut or damaged, or announces more pixels than the limit.
     """
     import_extra("PIL")
     from PIL import Image, ImageOps
 
-    file = Path(path)
-    if not file.exists():
-        raise FileNotFoundError(f"image must exist: got {str(path)!r}; check the spelling.")
-    try:
-        with Image.open(file) as image:
-            # Annotators saw the photograph upright, so keypoints count from its upright corner.
-            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(
-            f"image must be a photograph that opens: got {str(path)!r} ({error})."
-        ) from error
+    file = as_file(path, "image")
+    Image.init()
+    # Pillow hands .eps over to Ghostscript, which runs what they say.
+    formats = [name for name in Image.OPEN if name != "EPS"]
+    with file_errors("image", file), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            with Image.open(file, formats=formats) as image:
+                width, height = image.size
+                check_bytes("image", path, 3 * width * height, max_bytes)
+                # Annotators saw the photograph upright, so keypoints count from its upright corner.
+                return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+        except (TooLargeError, MemoryError):
+            raise
+        except Exception as error:  # each of Pillow's readers fails in its own way
+            raise ValueError(
+                f"image must be a photograph that opens: got {str(path)!r} ({error})."
+            ) from error
 
 
 def _as_photograph(image: Any) -> Float[np.ndarray, "height width 3"]:
