@@ -196,7 +196,9 @@ def socket_that_never_reads(view):
     client.send_request(client.connect())
     away.sendall(b"".join(client.data_to_send()))
     while client.state is not State.OPEN:
-        client.receive_data(away.recv(64))
+        part = away.recv(64)
+        assert part, client.handshake_exc
+        client.receive_data(part)
     client.send_binary(msgspec.msgpack.encode(_CAMERA))
     away.sendall(b"".join(client.data_to_send()))
     return away

@@ -65,8 +65,7 @@ def test_a_browser_that_stays_away_holds_nobody_up_and_is_let_go(view):
         wait_until(lambda: len(view.server.get_clients()) == 2)
         move(other)
         before = buffered(view)
-        while not unsent_bytes(view):
-            move(other)
+        wait_until(lambda: move(other) or unsent_bytes(view))
         for _ in range(20):
             move(other)
         assert buffered(view) <= before + 8  # the newest of each kind
@@ -77,9 +76,12 @@ def test_a_browser_that_stays_away_holds_nobody_up_and_is_let_go(view):
 def test_a_browser_that_stays_away_does_not_keep_the_view_from_ending(tmp_path):
     trimesh.creation.icosphere(subdivisions=6).export(tmp_path / "ball.ply")
     with served(tmp_path / "ball.ply") as view, socket_that_never_reads(view):
-        while not unsent_bytes(view):
+
+        def show_again():
             view._do("reset", "reset")
             assert view.worker.wait_until_idle(SECONDS)
+
+        wait_until(lambda: show_again() or unsent_bytes(view))
         view.stop_serving()
         assert not view.server._websock_server._server_thread.is_alive()
 
