@@ -185,7 +185,8 @@ def test_stl_as_people_have_it(tmp_path):
     file, mesh = tmp_path / "a.stl", box(center=(0.5, 0.5, 0.5))
     for end in ("endsolid", "end solid"):
         text = stl_text(mesh, end)
-        for content in (text, text.replace("\n", "\r\n"), text.upper(), text + text):
+        one_line = " ".join(text.split())
+        for content in (text, text.replace("\n", "\r\n"), text.upper(), text + text, one_line):
             file.write_text(content)
             assert open_mesh(file).raw.faces.shape == (12 * content.upper().count("SOLID") // 2, 3)
     noisy = stl_text(mesh).replace("vertex 0.0 0.0 0.0", "vertex 1e-17 0.0 0.0", 1)
@@ -435,3 +436,30 @@ def test_lines_of_a_ply_that_say_more_than_the_header(tmp_path):
     assert found.notes == (
         "numbers at the ends of lines that its header does not name are left out",
     )
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_lists_of_differing_lengths_between_other_properties(tmp_path, order):
+    """Polygons of a binary .ply with a number before the list and a colour behind it."""
+    vertices, polygons, volume = star_prism()
+    form = "little" if order == "<" else "big"
+    header = f"ply\nformat binary_{form}_endian 1.0\nelement vertex {len(vertices)}\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz")
+    header += f"element face {len(polygons)}\nproperty short part\n"
+    header += "property list ushort uint vertex_index\nproperty uchar red\nend_header\n"
+    body = vertices.astype(order + "f8").tobytes()
+    for k, polygon in enumerate(polygons):
+        row = (k, len(polygon), *polygon, 200 + k)
+        body += struct.pack(f"{order}hH{len(polygon)}IB", *row)
+    file = tmp_path / "a.ply"
+    file.write_bytes(header.encode() + body)
+    opened = open_mesh(file)
+    assert signed_volume(opened.vertices, opened.faces) == pytest.approx(volume)
+    opened.write(tmp_path / "b.ply", opened.vertices)
+    raw = trimesh.load_mesh(tmp_path / "b.ply", process=False).metadata["_ply_raw"]["face"]["data"]
+    owners = np.repeat(np.arange(12), [8, 8] + [2] * 10)
+    np.testing.assert_array_equal(raw["part"], owners)
+    np.testing.assert_array_equal(raw["red"], 200 + owners)
+    file.write_bytes(header.encode() + body[:-4])
+    with pytest.raises(ValueError, match="ends at face 11 of 12; it is cut"):
+        read_mesh(file)

@@ -48,7 +48,7 @@ def read_off(content: bytes) -> RawMesh:
     points, at = _rows(rows, 1, vertex_count, lambda fields: width, "vertex")
     polygons, at = _rows(rows, at, face_count, lambda fields: 1 + int(fields[0]), "face")
     try:
-        vertices = np.array([row[:3] for row in points], np.float64).reshape(-1, 3)
+        vertices = np.array([float(field) for row in points for field in row[:3]]).reshape(-1, 3)
         counts = np.array([int(row[0]) for row in polygons], np.int64)
         corners = [
             int(field) for row, n in zip(polygons, counts, strict=True) for field in row[1 : 1 + n]

@@ -213,7 +213,47 @@ def _read_rows(element: Element, source: "_Text | _Binary") -> None:
             k += 1
         return
     source.place = start
+    if isinstance(source, _Binary) and sum(c is not None for c, _ in element.types.values()) == 1:
+        _read_one_list(element, source)
+        return
     _fill(element, [_row(element, source, row) for row in range(element.length)])
+
+
+def _read_one_list(element: Element, source: _Binary) -> None:
+    """Fill in an element whose rows have one list each, of differing lengths, quickly."""
+    names = list(element.types)
+    at = next(k for k, name in enumerate(names) if element.types[name][0] is not None)
+    fixed = [(name, source.order + element.types[name][1]) for name in names if name != names[at]]
+    before = sum(np.dtype(element.types[name][1]).itemsize for name in names[:at])
+    after = sum(np.dtype(element.types[name][1]).itemsize for name in names[at + 1 :])
+    count, kind = element.types[names[at]]
+    count_type, item_type = np.dtype(source.order + str(count)), np.dtype(source.order + kind)
+    if count_type.kind not in "iu":
+        raise UnreadableError(f"{names[at]} of {element.name} counts its values by {count}")
+    content, place, end = source.content, source.place, len(source.content)
+    order = "little" if source.order == "<" else "big"
+    width, signed = count_type.itemsize, count_type.kind == "i"
+    counts, lists, scalars = [], [], []
+    for row in range(element.length):
+        first = place + before + width
+        size = int.from_bytes(content[place + before : first], order, signed=signed)
+        last = first + size * item_type.itemsize
+        if size < 0 or last + after > end:
+            raise UnreadableError(
+                f"it ends at {element.name} {row} of {element.length:,}; it is cut"
+            )
+        counts.append(size)
+        lists.append(content[first:last])
+        scalars += [content[place : place + before], content[last : last + after]]
+        place = last + after
+    source.place = place
+    values = np.frombuffer(b"".join(lists), item_type).astype(kind)
+    rows = np.frombuffer(b"".join(scalars), fixed) if fixed else None
+    for name in names:
+        if name == names[at]:
+            element.data[name] = Lists(np.array(counts, np.int64), values)
+        elif rows is not None:
+            element.data[name] = rows[name].astype(element.types[name][1])
 
 
 def _fill(element: Element, found: list[tuple[list[np.ndarray], list[int]]]) -> None:

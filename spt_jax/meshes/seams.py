@@ -55,13 +55,13 @@ def closed_seams(
 
 def _at_one_place(vertices: np.ndarray, loose: np.ndarray, double: bool) -> np.ndarray:
     """Of each loose vertex, the first of them in the same place."""
-    _, first, group = np.unique(
-        vertices[loose] + 0.0,  # -0.0 becomes 0.0
-        axis=0,
-        return_index=True,
-        return_inverse=True,
-    )
-    return first[group.ravel()]
+    points = vertices[loose]
+    order = np.lexsort(points.T)  # stable: the first of equals comes first
+    ahead = points[order[1:]] != points[order[:-1]]
+    group = np.cumsum(np.concatenate([[0], ahead.any(axis=1)]))
+    first = np.empty(len(loose), np.int64)
+    first[order] = order[np.searchsorted(group, group)]
+    return first
 
 
 def _within_rounding(vertices: np.ndarray, loose: np.ndarray, double: bool) -> np.ndarray:

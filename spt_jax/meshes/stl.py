@@ -11,6 +11,14 @@ import numpy as np
 from .raw import RawMesh, UnreadableError, holds_double
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+# A triangle of a text as almost all programs write it; None stands for a number.
+_LAYOUT = (
+    *(b"facet", b"normal", None, None, None, b"outer", b"loop"),
+    *(b"vertex", None, None, None) * 3,
+    *(b"endloop", b"endfacet"),
+)
+_PLACES = [7 + 4 * corner + 1 + axis for corner in range(3) for axis in range(3)]
+_NAMES = re.compile(rb"^[ \t]*(end[ \t]*)?solid\b[^\r\n]*", re.M | re.I)
 _LOOP = re.compile(rb"outer\s+loop(.*?)end\s*loop", re.S | re.I)
 _NUMBER = rb"[-+.0-9a-zA-Z]+"
 _CORNERS = re.compile(
@@ -54,6 +62,29 @@ def _binary(content: bytes, announced: int, expected: int) -> RawMesh:
 
 
 def _text(content: bytes) -> RawMesh:
+    words = _NAMES.sub(b" ", content).split()
+    regular = (
+        bool(words)
+        and len(words) % len(_LAYOUT) == 0
+        and all(
+            word is None or set(words[k :: len(_LAYOUT)]) <= {word}
+            for k, word in enumerate(_LAYOUT)
+        )
+    )
+    if regular:
+        columns = [words[k :: len(_LAYOUT)] for k in _PLACES]
+        numbers = [number for facet in zip(*columns, strict=True) for number in facet]
+    else:
+        numbers = _loops(content)
+    try:
+        vertices = np.array(list(map(float, numbers)), np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise UnreadableError(f"a vertex does not hold numbers ({error})") from None
+    return RawMesh(vertices, _in_threes(vertices), double=holds_double(vertices))
+
+
+def _loops(content: bytes) -> list[bytes]:
+    """The corners' numbers of a text that is laid out in another way, or damaged."""
     numbers: list[bytes] = []
     loops = 0
     for loops, loop in enumerate(_LOOP.finditer(content), 1):
@@ -65,11 +96,7 @@ def _text(content: bytes) -> RawMesh:
     begun = len(re.findall(rb"outer\s+loop", content, re.I))
     if begun != loops:
         raise UnreadableError(f"triangle {loops} has no end; it is cut")
-    try:
-        vertices = np.array(numbers, np.float64).reshape(-1, 3)
-    except ValueError as error:
-        raise UnreadableError(f"a vertex does not hold numbers ({error})") from None
-    return RawMesh(vertices, _in_threes(vertices), double=holds_double(vertices))
+    return numbers
 
 
 def _in_threes(corners: np.ndarray) -> np.ndarray:
