@@ -153,10 +153,16 @@ def read_bytes(
     """
     file = as_file(path, what)
     with file_errors(what, file), open(file, "rb") as stream:
-        check_bytes(what, path, os.fstat(stream.fileno()).st_size, max_bytes)
-        limit = MAX_BYTES if max_bytes is None else max_bytes
-        # Files of the system announce a size of 0.
-        content = stream.read(limit + 1)
+        size = os.fstat(stream.fileno()).st_size
+        check_bytes(what, path, size, max_bytes)
+        # Files of the system announce a size of 0, and others may grow. A read asks for as much
+        # memory as it may return, so none is of the limit's size.
+        left = (MAX_BYTES if max_bytes is None else max_bytes) + 1
+        pieces: list[bytes] = []
+        while piece := stream.read(min(left, size + 1 if not pieces else 2**20)):
+            pieces.append(piece)
+            left -= len(piece)
+        content = b"".join(pieces)
     check_bytes(what, path, len(content), max_bytes)
     return content
 

@@ -160,6 +160,17 @@ def test_what_is_no_regular_file_is_named(tmp_path):
         read_bytes(__file__, max_bytes=0)
 
 
+def test_a_small_file_is_read_without_room_for_the_limit(tmp_path):
+    file = tmp_path / "small"
+    file.write_bytes(b"abc")
+    tracemalloc.start()
+    content = read_bytes(file)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert content == b"abc" and peak < 2**22
+    assert len(read_bytes("/proc/self/maps")) > 2  # which announces a size of 0
+
+
 def test_errors_get_their_file(tmp_path):
     with pytest.raises(ValueError, match=r"mesh file must fit into memory: got 'a\.ply'"):
         with file_errors("mesh file", "a.ply"):

@@ -20,6 +20,7 @@ _LAYOUT = (
 _PLACES = [7 + 4 * corner + 1 + axis for corner in range(3) for axis in range(3)]
 _NAMES = re.compile(rb"^[ \t]*(end[ \t]*)?solid\b[^\r\n]*", re.M | re.I)
 _LOOP = re.compile(rb"outer\s+loop(.*?)end\s*loop", re.S | re.I)
+_LONGEST_END = 2**16  # of what follows the last triangle
 _NUMBER = rb"[-+.0-9a-zA-Z]+"
 _CORNERS = re.compile(
     rb"\s*" + rb"\s+".join([rb"vertex" + 3 * (rb"\s+(" + _NUMBER + rb")")] * 3) + rb"\s*", re.I
@@ -62,6 +63,9 @@ def _binary(content: bytes, announced: int, expected: int) -> RawMesh:
 
 
 def _text(content: bytes) -> RawMesh:
+    end = content[-_LONGEST_END:].lower()
+    if not re.search(rb"end\s*solid", end[max(end.rfind(b"facet"), 0) :]):
+        raise UnreadableError("it does not end with endsolid; it is cut")
     words = _NAMES.sub(b" ", content).split()
     regular = (
         bool(words)
