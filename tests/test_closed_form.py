@@ -303,6 +303,33 @@ def test_copies_in_one_place(count, turned):
     assert growth == pytest.approx(3 * found.volume, rel=1e-10)
 
 
+@pytest.mark.parametrize("upright, turned_over", [(1, 1), (2, 1), (3, 1), (1, 2), (0, 2), (2, 2)])
+@pytest.mark.parametrize("other", [None, box((0.3, 2, 0.3), (0.1, 0, 0.2))])
+def test_copies_inside_out_take_one_away(upright, turned_over, other):
+    """In a ball that is there a times, and b times inside out, w is a - b; a place is a kink."""
+    balls = [BALL] * upright + [inverted(BALL)] * turned_over
+    mesh = _turned(join(*balls, *([] if other is None else [other])))
+    found, net = solved(mesh), upright - turned_over
+    expected = net * (net - 1) / 2 * signed_volume(*BALL)
+    if other is not None:  # one more in both
+        expected += net * boolean_overlap(BALL, other)
+    assert found.exact and found.volume == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    pull, size = found.gradient("boundary", "vertex"), np.abs(mesh[0]).max()
+    assert np.abs(pull.sum(axis=0)).max() < 1e-12 * size**2
+    growth = np.sum(pull * (mesh[0] - mesh[0].mean(axis=0)))
+    assert growth == pytest.approx(3 * found.volume, rel=1e-9, abs=1e-12)
+    assert (found.volume != 0) == pull.any()
+
+
+def test_what_copies_share_stays_where_they_touch_another():
+    mesh = _turned(join(box(), box(), box(center=(1, 0, 0))))
+    found = solved(mesh)
+    assert found.volume == pytest.approx(1, rel=1e-12)
+    pull = found.gradient("boundary", "vertex")
+    assert np.sum(pull * mesh[0]) == pytest.approx(3, rel=1e-12)
+    assert not pull[16:].any()
+
+
 def test_copies_among_others_and_listed_in_another_order():
     """A copy counts for every pair it is in, also where its faces come in another order."""
     rng = np.random.default_rng(4)

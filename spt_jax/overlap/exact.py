@@ -102,7 +102,7 @@ class ExactOverlap:
         total = gradient_of(faces, self._whole.shares, None, count)
         if self.judged is not None:
             total += self._judged_gradient(self.judged)
-        total = surface.with_copies(total / surface.scale**2)
+        total = surface.shared_out(total / surface.scale**2)
         return surface.manifold.gather(total, surface.count)
 
     def _judged_gradient(self, judged: Judged) -> Float[np.ndarray, "X 3"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from spt_jax.overlap.exclusions import Exclusions, part_rules
-from spt_jax.overlap.triangles.closed_form import Shares, shares_of, volumes_of
+from spt_jax.overlap.triangles.closed_form import Shares, of_copies, shares_of, volumes_of
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours, find_contours
 from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
@@ -79,13 +79,11 @@ class ExactSurface:
         self.manifold: Manifold = manifold_of(faces, len(vertices))
         placed = self.manifold.place(vertices)
         # Of parts that lie on each other, vertex on vertex, one is measured for all.
-        self.parts_times = self.times = None
+        self.parts_times = self.times = self._listed = None
         if merged and self.manifold.num_parts > 1:
-            first = self.manifold.copies(placed)
+            first, sense = self.manifold.copies(placed)
             if (first != np.arange(len(first))).any():
-                self.manifold, self._copies, self._originals = self.manifold.without(first)
-                self.parts_times = np.bincount(first, minlength=len(first))
-                self.times = self.parts_times[self.manifold.part[self.manifold.faces[:, 0]]]
+                self._merge(first, sense)
         self._faces = self.manifold.faces
         self.predicates = Predicates(placed, self._faces, self.manifold.part)
         self.scale = self.predicates.scale
@@ -97,6 +95,28 @@ class ExactSurface:
             self.points, self._faces, predicates=self.predicates, reach=self._reach
         )
         self.contours = find_contours(self.points, self.topology, self.crossings)
+
+    def _merge(self, first: Int[np.ndarray, "P"], sense: Int[np.ndarray, "P"]) -> None:
+        """Measure each of these parts for all that lie in its place.
+
+        One that is turned inside out takes one away: they lie in each other without a volume, where
+        the derivative has a kink, and count as neither moving.
+        """
+        net = np.bincount(first, sense, len(first)).astype(np.int64)
+        # The one that is measured has the sense of most.
+        turned = np.flatnonzero(net[first] < 0)
+        most = turned[sense[turned] < 0]
+        leader = np.arange(len(first))
+        leader[first[most[::-1]]] = most[::-1]
+        first, sense = leader[first], np.where(net[first] < 0, -sense, sense)
+        self.manifold, self._copies, self._originals = self.manifold.without(first)
+        self.parts_times = np.abs(np.bincount(first, sense, len(first)).astype(np.int64))
+        of_face = self.manifold.part[self.manifold.faces[:, 0]]
+        self.times = self.parts_times[of_face]
+        self._listed = np.bincount(first, minlength=len(first))[of_face]
+        alike = np.bincount(first[sense > 0], minlength=len(first))
+        share = np.where(sense > 0, self.parts_times[first] / np.maximum(alike, 1)[first], 0.0)
+        self._moving = share[self.manifold.part]
 
     @cached_property
     def contacts(self) -> Contacts:
@@ -124,6 +144,12 @@ class ExactSurface:
             values[self._copies] = values[self._originals]
         return values
 
+    def shared_out(self, forces: Float[np.ndarray, "X 3"]) -> Float[np.ndarray, "X 3"]:
+        """Forces on one of the parts that lie in one place, as those on each of them."""
+        if self.times is not None:
+            forces = self._moving[:, None] * self.with_copies(forces)
+        return forces
+
     def of_given(self, values: Shaped[np.ndarray, "V"]) -> Shaped[np.ndarray, "V"]:
         """The same for values at the vertices given."""
         if self.times is not None:
@@ -135,9 +161,9 @@ class ExactSurface:
 
     def count_pairs(self, on: Bool[np.ndarray, "P"]) -> int:
         """How many pairs of the triangles given some contours stand for."""
-        if self.times is None:
+        if self._listed is None:
             return int(np.count_nonzero(on))
-        return int(self.times[self.contours.pair[on]].prod(axis=1).sum())
+        return int(self._listed[self.contours.pair[on]].prod(axis=1).sum())
 
     def layers(self, exclusions: Exclusions) -> list[Layer]:
         """The overlaps that count whole, and those that are judged by their contours."""
@@ -199,17 +225,22 @@ class ExactSurface:
         touching[at[proper]] = False
         if not touching.any():
             return layer
-        shares = layer.shares
-        volume = volumes_of(self.points, self._faces, shares, region, count, self.times)
+        shares, own = layer.shares, np.zeros(len(layer.shares.faces))
+        if self.times is not None:
+            own = of_copies(self.times[shares.faces])
+        between = replace(shares, share=shares.share - own[:, None])
+        volume = volumes_of(self.points, self._faces, between, region, count, self.times)
         area = np.bincount(region, np.sqrt(dot(shares.normals, shares.normals)), count)
         kept = ~(touching & (np.abs(volume) <= 2 * self._reach * area))
         segments = layer.segments.copy()
         segments[segments] = kept[at]
+        # What copies of one part share with each other stays.
+        share = np.where(kept[region][:, None], shares.share, own[:, None])
         return replace(
             layer,
             segments=segments,
             contours=layer.contours.only(kept[at]),
-            shares=shares.only(kept[region]),
+            shares=replace(shares, share=share).only(kept[region] | (own != 0)),
             dropped=shares.faces[~kept[region]],
         )
 

@@ -94,7 +94,7 @@ def shares_of(
     hot = a | b | c
     hot[contours.pair] = True
     if times is not None:
-        hot |= times > 1
+        hot |= times != 1
     found = np.flatnonzero(hot)
     row = np.full(len(faces), -1)
     row[found] = np.arange(len(found))
@@ -114,8 +114,13 @@ def shares_of(
     sound[row[contours.pair[~contours.whole]]] = False
     share = sums[:, :3]
     if times is not None:
-        share = share + (times[found, None] - 1) / 12.0  # half of the integral of lambda
+        share = share + of_copies(times[found])[:, None]
     return Shares(found, normals, share, sound)
+
+
+def of_copies(times: Int[np.ndarray, "H"]) -> Float[np.ndarray, "H"]:
+    """What copies of a triangle share with each other, at each corner, in the mean of them."""
+    return (times - 1) / 12.0  # half of the integral of lambda
 
 
 def _coordinates(vertices, topology, crossings, contours: Contours, corners, normals):

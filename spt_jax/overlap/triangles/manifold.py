@@ -60,9 +60,15 @@ class Manifold:
         order = np.argsort(part, kind="stable")
         return order, np.append(0, np.cumsum(np.bincount(part, minlength=self.num_parts)))
 
-    def copies(self, placed: Float[np.ndarray, "X 3"]) -> Int[np.ndarray, "P"]:
-        """For each part the first one that lies where it does, vertex on vertex."""
-        first = np.arange(self.num_parts)
+    def copies(
+        self, placed: Float[np.ndarray, "X 3"]
+    ) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+        """For each part the first one that lies where it does, vertex on vertex.
+
+        Returns:
+            The parts, and -1 for those that are the other one turned inside out, else 1.
+        """
+        first, sense = np.arange(self.num_parts), np.ones(self.num_parts, np.int64)
         (vertex, begin), (face, start) = self._by_part, self._faces_by_part
         size = np.stack([np.diff(begin), np.diff(start)], axis=1)
         solid = np.flatnonzero(size[:, 1])
@@ -70,23 +76,22 @@ class Manifold:
         order = np.lexsort(key.T)
         alike = (key[order[1:]] == key[order[:-1]]).all(axis=1)
         if not alike.any():
-            return first
+            return first, sense
         run = np.concatenate([[0], np.cumsum(~alike)])
         for group in np.split(solid[order], np.flatnonzero(np.diff(run)) + 1):
-            leaders: list[int] = []
-            for part in np.sort(group).tolist():
+            leaders: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+            for part in np.sort(group).tolist() if len(group) > 1 else ():
                 own = vertex[begin[part] : begin[part + 1]]
                 corners = np.searchsorted(own, self.faces[face[start[part] : start[part + 1]]])
-                for leader in leaders:
-                    there = vertex[begin[leader] : begin[leader + 1]]
-                    faces = self.faces[face[start[leader] : start[leader + 1]]]
-                    same = np.array_equal(placed[own], placed[there])
-                    if same and np.array_equal(corners, np.searchsorted(there, faces)):
-                        first[part] = leader
+                faces, places = _in_order(corners), placed[own]
+                for leader, known, turned, there in leaders:
+                    same, inside_out = (np.array_equal(faces, x) for x in (known, turned))
+                    if (same or inside_out) and np.array_equal(places, there):
+                        first[part], sense[part] = leader, 1 if same else -1
                         break
                 else:
-                    leaders.append(part)
-        return first
+                    leaders.append((part, faces, _in_order(corners[:, ::-1]), places))
+        return first, sense
 
     def without(
         self, first: Int[np.ndarray, "P"]
@@ -119,6 +124,13 @@ class Manifold:
             at.append(loop)
             rows.append(np.repeat(force[None] / len(loop), len(loop), axis=0))
         return summed(np.concatenate(at), np.concatenate(rows), count)
+
+
+def _in_order(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F 3"]:
+    """The same faces, each from its lowest corner on, sorted."""
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, turn, axis=1)
+    return faces[np.lexsort(faces.T[::-1])]
 
 
 def manifold_of(faces: Int[np.ndarray, "F 3"], count: int) -> Manifold:
