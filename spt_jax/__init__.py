@@ -7,6 +7,7 @@ from spt_jax.body import BodyModel as BodyModel
 from spt_jax.body import PosedBody as PosedBody
 from spt_jax.body import load_body as load_body
 from spt_jax.body import load_mocap as load_mocap
+from spt_jax.caches import clear_caches as clear_caches
 from spt_jax.camera import PinholeCamera as PinholeCamera
 from spt_jax.classes import VertexClasses as VertexClasses
 from spt_jax.classes import classify_vertices as classify_vertices

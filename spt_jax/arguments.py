@@ -2,6 +2,7 @@
 
 from typing import Any, Literal, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -19,10 +20,18 @@ def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Inte
     """The mesh as JAX arrays.
 
     Raises:
-        TypeError: vertices not floating point, faces not whole numbers.
-        ValueError: a shape that is not (..., V, 3) or (F, 3); an index out of range, where the
-            faces' values are known (inside `jit` with traced faces they are not, and such a mesh
-            gives NaN).
+        TypeError, ValueError: as `as_vertices` and `as_faces`.
+    """
+    checked = as_vertices(vertices)
+    return checked, jnp.asarray(as_faces(faces, checked.shape[-2]))
+
+
+def as_vertices(vertices: Any) -> Float[Array, "*batch V 3"]:
+    """Positions as a JAX array.
+
+    Raises:
+        TypeError: not floating point.
+        ValueError: a shape that is not (..., V, 3).
     """
     given = getattr(vertices, "dtype", None)
     if given is None:
@@ -38,21 +47,35 @@ def as_mesh(vertices: Any, faces: Any) -> tuple[Float[Array, "*batch V 3"], Inte
         raise ValueError(
             f"vertices must have shape (..., V, 3): got {shape}; the last axis is x, y, z."
         )
+    # Not jnp.asarray, which compiles a program for each shape.
+    return vertices if isinstance(vertices, jax.Array) else jax.device_put(vertices)
+
+
+def as_faces(faces: Any, num_vertices: int) -> Integer[Array | np.ndarray, "F 3"]:
+    """Indices of corners: a NumPy array where their values are known.
+
+    Raises:
+        TypeError: not whole numbers.
+        ValueError: a shape that is not (F, 3); an index out of range, where the values are known
+            (inside `jit` with traced faces they are not, and such a mesh gives NaN).
+    """
     given = getattr(faces, "dtype", None)
     if given is None:
         faces = np.asarray(faces)
         given = faces.dtype
     if not np.issubdtype(given, np.integer):
         raise TypeError(f"faces must be whole numbers: got {given}; use int32 indices.")
-    face_shape = np.shape(faces)
-    if len(face_shape) != 2 or face_shape[-1] != 3:
+    shape = np.shape(faces)
+    if len(shape) != 2 or shape[-1] != 3:
         raise ValueError(
-            f"faces must have shape (F, 3): got {face_shape}; split other polygons into "
+            f"faces must have shape (F, 3): got {shape}; split other polygons into "
             "triangles, and batch meshes of different faces with jax.vmap."
         )
-    if not isinstance(faces, Tracer):
-        check_indices(np.asarray(faces), shape[-2])
-    return jnp.asarray(vertices), jnp.asarray(faces)
+    if isinstance(faces, Tracer):
+        return faces
+    known = np.asarray(faces)
+    check_indices(known, num_vertices)
+    return known
 
 
 def check_indices(faces: np.ndarray, num_vertices: int) -> None:

@@ -1,16 +1,22 @@
 """Which vertices lie in self-intersection: V_0, V_out and V_in of the paper's Algorithm 1."""
 
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int8, Integer
 
-from spt_jax.arguments import as_backend, as_choice, as_directions, as_mesh, as_rays
-from spt_jax.device.backend import Task, labels_on_device
+from spt_jax.arguments import (
+    as_backend,
+    as_choice,
+    as_directions,
+    as_faces,
+    as_rays,
+    as_vertices,
+)
+from spt_jax.bounded_jit import BoundedJit
+from spt_jax.device.backend import Program, Task, as_task, labels_on_device
 from spt_jax.device.settings import Xla
 from spt_jax.exclusions import as_exclusions
 from spt_jax.host import call_on_host
@@ -122,14 +128,21 @@ def classify_vertices(
         >>> print(classes.ratio)
         0.5
     """
-    given = faces
-    vertices, faces = as_mesh(vertices, faces)
+    vertices = as_vertices(vertices)
+    faces = as_faces(faces, vertices.shape[-2])
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    exclusions = as_exclusions(face_groups, ignore_groups, folds, given)
-    rounding = float(jnp.finfo(vertices.dtype).eps)
+    exclusions = as_exclusions(face_groups, ignore_groups, folds, faces)
+    rule = as_choice("rule", rule, Rule)
     device = as_backend(backend)
-    options = _Options(as_choice("rule", rule, Rule), sampling, exclusions, rounding, device)
-    return VertexClasses(_labels(options, vertices, faces))
+    if device is not None:
+        program = Program(device, sampling.rays, rule=rule)
+        task = as_task(program, sampling, vertices.dtype, exclusions)
+        return VertexClasses(_on_device(program, vertices, jnp.asarray(faces), task.tables))
+    rounding = float(np.finfo(vertices.dtype).eps)
+    options = _Options(rule, sampling, exclusions, rounding)
+    results = ((vertices.shape[-2:-1], "int8"),)
+    (label,) = call_on_host(_labels_on_host, options, results, vertices, faces)
+    return VertexClasses(label)
 
 
 class _Options(NamedTuple):
@@ -137,17 +150,13 @@ class _Options(NamedTuple):
     sampling: Sampling
     exclusions: Exclusions
     rounding: float  # machine epsilon of the vertices
-    device: Xla | None  # None: the host
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _labels(options, vertices, faces):
-    if options.device is not None:
-        task = Task(options.sampling, options.exclusions, rule=options.rule)
-        return labels_on_device(vertices, faces, options.device, task).astype(jnp.int8)
-    results = ((vertices.shape[-2:-1], "int8"),)
-    (label,) = call_on_host(_labels_on_host, options, results, vertices, faces)
-    return label
+def _labels_of(program, vertices, faces, tables):
+    return labels_on_device(vertices, faces, Task(program, tables)).astype(jnp.int8)
+
+
+_on_device = BoundedJit(_labels_of)
 
 
 def _labels_on_host(vertices, faces, options: _Options):

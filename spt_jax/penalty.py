@@ -6,24 +6,28 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import (
     as_backend,
     as_choice,
     as_directions,
+    as_faces,
     as_margin,
-    as_mesh,
     as_rays,
+    as_vertices,
 )
-from spt_jax.device.backend import Task, penalty_on_device
+from spt_jax.bounded_jit import BoundedJit
+from spt_jax.device.backend import Program, Task, as_task, penalty_on_device
 from spt_jax.device.settings import Xla
 from spt_jax.exclusions import as_exclusions
 from spt_jax.geometry import inflate
-from spt_jax.host import call_on_host
+from spt_jax.host import call_on_host, is_local
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Gradient, Rule, Sampling, Unmeasurable, Value, measure
 from spt_jax.rest_surface import RestSurface
+from spt_jax.reverse_only import refuse_forward, with_slope
 
 
 def self_intersection_penalty(
@@ -127,21 +131,29 @@ def self_intersection_penalty(
         >>> print(f"{push[0]:.1f}")
         -1.0
     """
-    given = faces
-    vertices, faces = as_mesh(vertices, faces)
+    vertices = as_vertices(vertices)
+    faces = as_faces(faces, vertices.shape[-2])
     apart = as_margin(margin)
     options = _Options(
         as_choice("value", value, Value),
         as_choice("gradient", gradient, Gradient),
         as_choice("rule", rule, Rule),
         Sampling(as_rays(rays), as_directions(directions)),
-        as_exclusions(face_groups, ignore_groups, folds, given),
-        float(jnp.finfo(vertices.dtype).eps),
-        as_backend(backend),
+        as_exclusions(face_groups, ignore_groups, folds, faces),
+        float(np.finfo(vertices.dtype).eps),
     )
+    device = as_backend(backend)
     if apart:
         vertices = inflate(vertices, faces, apart / 2)
-    return _penalty(options, vertices, faces)
+    vertices = refuse_forward(vertices)
+    if device is not None:
+        program = Program(device, options.sampling.rays, options.value, None, options.rule)
+        task = as_task(program, options.sampling, vertices.dtype, options.exclusions)
+        way = program, options.gradient
+        return _on_device(way, vertices, jnp.asarray(faces), task.tables)
+    if isinstance(faces, Tracer):
+        return _differentiable(options, None, vertices, faces)
+    return _differentiable(options, _Known(np.asarray(faces)), vertices, ())
 
 
 def paper_penalty(
@@ -200,42 +212,65 @@ class _Options(NamedTuple):
     sampling: Sampling
     exclusions: Exclusions
     rounding: float  # machine epsilon of the vertices
-    device: Xla | None  # None: the host
-
-    def task(self, *, with_gradient: bool) -> Task:
-        """The same for the device path."""
-        gradient = self.gradient if with_gradient else None
-        return Task(self.sampling, self.exclusions, self.value, gradient, self.rule)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _differentiable(options, vertices, faces):
-    if options.device is not None:
-        task = options.task(with_gradient=False)
-        return penalty_on_device(vertices, faces, options.device, task)[0]
+class _Known(NamedTuple):
+    """Faces whose values are known: no operand, and nothing to differentiate."""
+
+    faces: np.ndarray
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _differentiable(options, known, vertices, traced):
+    faces = traced if known is None else known.faces
     (value,) = call_on_host(_value_on_host, options, (_scalar(vertices),), vertices, faces)
     return value
 
 
-def _penalty_forward(options, vertices, faces):
-    if options.device is not None:
-        task = options.task(with_gradient=True)
-        return penalty_on_device(vertices, faces, options.device, task)
+def _penalty_forward(options, known, vertices, traced):
+    faces = traced if known is None else known.faces
     results = (_scalar(vertices), (vertices.shape[-2:], vertices.dtype.name))
     # The residual is the gradient: the backward pass never calls the host.
     value, gradient = call_on_host(_value_and_gradient_on_host, options, results, vertices, faces)
-    return value, gradient
+    return with_slope(vertices, value, gradient), gradient
 
 
-def _penalty_backward(options, gradient, cotangent):
-    # where, not a product alone: an infinite cotangent must not turn a zero gradient into NaN.
-    product = cotangent[..., None, None] * gradient
-    return jnp.where(gradient == 0, jnp.zeros_like(product), product), None
+def _penalty_backward(options, known, gradient, cotangent):
+    return _scaled(gradient, cotangent), None
 
 
 _differentiable.defvjp(_penalty_forward, _penalty_backward)
-# jit, so that a call outside any jit is traced once and not every time.
-_penalty = jax.jit(_differentiable, static_argnums=0)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _differentiable_on_device(way, vertices, faces, tables):
+    return penalty_on_device(vertices, faces, Task(way[0], tables))[0]
+
+
+def _forward_on_device(way, vertices, faces, tables):
+    program, kind = way
+    task = Task(program._replace(gradient=kind), tables)
+    value, gradient = penalty_on_device(vertices, faces, task)
+    return with_slope(vertices, value, gradient), gradient
+
+
+def _backward_on_device(way, gradient, cotangent):
+    return _scaled(gradient, cotangent), None, None
+
+
+_differentiable_on_device.defvjp(_forward_on_device, _backward_on_device)
+_on_device = BoundedJit(_differentiable_on_device)
+
+
+def _scaled(gradient, cotangent):
+    # where, not a product alone: an infinite cotangent must not turn a zero gradient into NaN.
+    if is_local(gradient) and is_local(cotangent):  # nothing to compile
+        known = np.asarray(gradient)
+        with np.errstate(all="ignore"):
+            product = np.asarray(cotangent)[..., None, None] * known
+        return jax.device_put(np.where(known == 0, np.zeros_like(known), product))
+    product = cotangent[..., None, None] * gradient
+    return jnp.where(gradient == 0, jnp.zeros_like(product), product)
 
 
 def _scalar(vertices):
@@ -251,22 +286,24 @@ def _value_and_gradient_on_host(vertices, faces, options: _Options):
 
 
 def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
-    gradient = np.zeros_like(vertices)
+    nothing = np.zeros_like(vertices)
     try:
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
     except Unmeasurable:
-        return np.array(np.nan), gradient
+        return np.array(np.nan), nothing
     if faces.size == 0:
-        return np.zeros(()), gradient
+        return np.zeros(()), nothing
     if options.value == "volume":
         value = np.array(found.volume)
     else:
         value = np.mean(found.labels(options.rule) != 0)
-    if with_gradient:
-        gradient = found.gradient(options.gradient, options.rule)
-    # Coordinates near overflow: measured in float64, and more than the vertices' dtype can hold.
+    gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
+    # Measured in float64: it may be more than the vertices' dtype can hold, or less.
     narrow = options.rounding > np.finfo(np.float64).eps
-    most = float(np.finfo(np.float32 if narrow else np.float64).max)
-    if not (abs(value) <= most and (np.abs(gradient) <= most).all()):
-        return np.array(np.nan), np.zeros_like(vertices)
+    held = np.finfo(np.float32 if narrow else np.float64)
+    if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
+        return np.array(np.nan), nothing
+    if options.value == "volume" and value < held.tiny:
+        # There is no overlap, but for rounding, or none that can be told from none: no slope.
+        return np.zeros(()), nothing
     return value, gradient

@@ -1,5 +1,9 @@
 """Two overlapping spheres as JAX sees them, for the tests of the penalty."""
 
+import contextlib
+import logging
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from helpers import join, sphere
@@ -17,3 +21,20 @@ def loss(vertices, faces=FACES):
 
 def as_jax(mesh, dtype):
     return jnp.asarray(mesh[0], dtype)
+
+
+@contextlib.contextmanager
+def compiled_names():
+    """What JAX compiles meanwhile."""
+    names = []
+    handler = logging.Handler()
+    handler.emit = lambda record: names.append(record.getMessage())
+    logger = logging.getLogger("jax._src.interpreters.pxla")
+    propagates, logger.propagate = logger.propagate, False
+    logger.addHandler(handler)
+    try:
+        with jax.log_compiles():
+            yield names
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagates

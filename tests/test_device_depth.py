@@ -12,7 +12,7 @@ import pytest
 from helpers import moved, random_rotation, sampling
 from helpers_depth import DEEP, as_mesh, by_rays, from_pairs, overlap, pushes
 
-from spt_jax.device.backend import Task, penalty_on_device
+from spt_jax.device.backend import Program, as_task, penalty_on_device
 from spt_jax.device.settings import Xla
 
 RAYS = 96
@@ -33,8 +33,9 @@ def padded(name, dtype, rotation=_TURNED):
 
 @jax.jit
 def on_device(vertices, faces):
-    task = Task(sampling(RAYS, [DIRECTION]), value="volume", gradient="boundary")
-    return penalty_on_device(vertices, faces, Xla(), task)
+    program = Program(Xla(), RAYS, value="volume", gradient="boundary")
+    task = as_task(program, sampling(RAYS, [DIRECTION]), vertices.dtype)
+    return penalty_on_device(vertices, faces, task)
 
 
 def together(function, mesh):

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from helpers import bent_tube, box, embedded_body, join, moved, random_rotation, sphere
 from helpers_device import SOLIDS, padded
+from helpers_penalty import compiled_names
 
 from spt_jax import RestSurface, self_intersection_penalty
 from spt_jax.device.exclusions import _folds, _near_at_rest
 from spt_jax.device.pair_search import over_crossing_pairs
 from spt_jax.device.patches import spread
+from spt_jax.device.tables import rest_table
 from spt_jax.device.triangle_pairs import cross_each_other
 from spt_jax.overlap.triangles.contours import find_contours
 from spt_jax.overlap.triangles.pair_layout import prepared
@@ -18,22 +20,31 @@ from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 
 
 def test_groups_as_on_the_host():
-    """What two of three boxes share does not count, nor does anything where they are only two."""
+    """What two of three boxes share does not count, nor does anything where they are only two.
+
+    Groups, pairs of them and directions are operands: one program serves all.
+    """
     faces = padded("three boxes", "float32")[1]
-    groups = np.concatenate([np.repeat([0, 1, 2], 12), np.full(len(faces) - 36, 2)])
 
-    def penalty(vertices, faces, backend):
-        return self_intersection_penalty(
-            vertices, faces, rays=48, face_groups=groups, ignore_groups=[(0, 1)], backend=backend
-        )
+    def both(name, backend, names=(0, 1, 2), directions=3):
+        groups = np.concatenate([np.repeat(names, 12), np.full(len(faces) - 36, names[2])])
+        options = {"face_groups": groups, "ignore_groups": [names[:2]], "directions": directions}
+        vertices, corners = padded(name, "float32")
+        return jax.value_and_grad(
+            lambda v: self_intersection_penalty(v, corners, rays=48, backend=backend, **options)
+        )(jax.device_put(vertices))
 
-    both = jax.jit(jax.value_and_grad(penalty), static_argnums=2)
-    found, expected = (both(*padded("three boxes", "float32"), name) for name in ("xla", "numpy"))
+    found, expected = (both("three boxes", backend) for backend in ("xla", "numpy"))
     assert float(found[0]) == pytest.approx(float(expected[0]), rel=1e-5) and found[0] > 0.1
     scale = np.abs(expected[1]).max()
     np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-5 * scale)
-    value, gradient = both(*padded("two boxes", "float32"), "xla")
-    assert value == 0 and not gradient.any()
+    with compiled_names() as compiled:
+        value, gradient = both("two boxes", "xla")
+        turned = np.eye(3) + 0.1 * np.arange(9).reshape(3, 3)
+        other, _ = both("three boxes", "xla", (0, 7, 5), turned)
+    assert compiled == []
+    assert value == 0 and not np.asarray(gradient).any()
+    assert float(other) == pytest.approx(float(found[0]), rel=0.1) and other != found[0]
 
 
 def test_what_is_near_depends_on_where(rng):
@@ -48,10 +59,10 @@ def test_what_is_near_depends_on_where(rng):
         f, g = rng.integers(0, folds.num_faces, (2, 20000))
         expected = folds.near(f, g, exact=True)
         pair = jnp.asarray(f, "int32"), jnp.asarray(g, "int32")
-        found = np.asarray(_near_at_rest(folds, *pair))
+        found = np.asarray(_near_at_rest(rest_table(folds), *pair))
         assert 0.01 < expected.mean() < 0.9 and np.mean(found != expected) < 0.005
         along = folds.between_faces(f, g)
-        same = np.asarray(_folds(folds, *pair, jnp.asarray(along, "float32")))
+        same = np.asarray(_folds(rest_table(folds).places, *pair, jnp.asarray(along, "float32")))
         np.testing.assert_array_equal(same, folds.near(f, g))
 
 
@@ -65,9 +76,9 @@ def test_fingers_are_near_exactly(rng):
     assert 0.02 < expected.mean() < 0.5
     for rest, shift in ((body.rest_surface, 0), (body.rest_surface.copies(2), len(body.faces))):
         pair = jnp.asarray(f + shift, "int32"), jnp.asarray(g + shift, "int32")
-        np.testing.assert_array_equal(_near_at_rest(rest, *pair), expected)
+        np.testing.assert_array_equal(_near_at_rest(rest_table(rest), *pair), expected)
     apart = jnp.asarray(f, "int32"), jnp.asarray(g + len(body.faces), "int32")
-    assert not _near_at_rest(body.rest_surface.copies(2), *apart).any()
+    assert not _near_at_rest(rest_table(body.rest_surface.copies(2)), *apart).any()
 
 
 def test_what_is_enclosed_at_rest_does_not_count():

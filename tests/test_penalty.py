@@ -14,10 +14,10 @@ from helpers import (
     random_rotation,
     sphere,
 )
-from helpers_penalty import FACES, HALF, PAIR, as_jax, loss
+from helpers_penalty import FACES, HALF, PAIR, as_jax, compiled_names, loss
 from jax.test_util import check_grads
 
-from spt_jax import classify_vertices, host, paper_penalty, penalty, self_intersection_penalty
+from spt_jax import classify_vertices, paper_penalty, self_intersection_penalty
 
 
 def test_value_and_gradient(dtype):
@@ -196,16 +196,29 @@ def test_repeated_calls_are_traced_once():
     for k in range(5):
         step(vertices + 0.01 * k)
     assert traces == 1
-    # Outside jit the penalty brings its own cache: nothing is traced again for the host either.
-    caches = (host._bridge, host._host_entry)
-    jax.value_and_grad(loss)(vertices)
-    loss(vertices)
-    before = penalty._penalty._cache_size(), [cache.cache_info().misses for cache in caches]
-    for k in range(5):
-        loss(vertices + 0.01 * k)
-        jax.value_and_grad(loss)(vertices + 0.01 * k)
-    after = penalty._penalty._cache_size(), [cache.cache_info().misses for cache in caches]
-    assert after == before
+
+
+def test_outside_jit_nothing_is_compiled_whatever_changes(dtype):
+    """New values of every option, and shapes, leave no program behind."""
+    groups = np.repeat([0, 1], len(FACES) // 2)
+
+    def calls(k):
+        options = {
+            "rays": 8 + k,
+            "directions": np.eye(3) + 0.01 * k,
+            "face_groups": np.roll(groups, k),
+            "ignore_groups": ((0, 1),),
+        }
+        more = np.concatenate([PAIR[0] + 0.1 * k, np.zeros((k, 3))])
+        more = jax.device_put(more.astype(dtype))
+        jax.value_and_grad(lambda v: self_intersection_penalty(v, FACES, **options))(more)
+        return classify_vertices(more, np.roll(FACES, k, axis=0))
+
+    calls(0)  # what JAX itself compiles for its own parts
+    with compiled_names() as names:
+        calls(1)
+        calls(2)
+    assert names == []
 
 
 def test_second_derivatives_take_the_penalty_as_linear(dtype):
@@ -225,6 +238,50 @@ def test_second_derivatives_take_the_penalty_as_linear(dtype):
     np.testing.assert_allclose(curved(zero), slope(zero), rtol=1e-4)
 
 
-def test_forward_mode_says_no():
-    with pytest.raises(TypeError, match="custom_vjp"):
-        jax.jvp(loss, (as_jax(PAIR, "float32"),), (as_jax(PAIR, "float32"),))
+@pytest.mark.parametrize("in_jit", [False, True])
+def test_hessians_of_functions_of_the_penalty_keep_their_own_curvature(dtype, in_jit):
+    """Of f(E): f''(E) g g^T, with E counted as linear; the third derivative likewise."""
+    vertices = as_jax(PAIR, dtype)
+    one = jax.jit(loss) if in_jit else loss
+
+    def moved_loss(t):
+        return one(vertices.at[HALF:].add(t))
+
+    at = jnp.zeros(3, dtype)
+    slope = np.asarray(jax.grad(moved_loss)(at))
+    square = jax.hessian(lambda t: moved_loss(t) ** 2)
+    expected = 2 * np.outer(slope, slope)
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(square(at), expected, rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(square)(at), expected, rtol=2e-5, atol=1e-6)
+    twice = jax.jacrev(jax.jacrev(lambda t: moved_loss(t) ** 2))
+    np.testing.assert_allclose(twice(at), expected, rtol=2e-5, atol=1e-6)
+    along = lambda s: moved_loss(jnp.stack([s, s, s])) ** 3  # noqa: E731
+    third = jax.grad(jax.grad(jax.grad(along)))(jnp.zeros((), dtype))
+    assert float(third) == pytest.approx(6 * slope.sum() ** 3, rel=1e-4)
+    batch = jax.vmap(square)(jnp.stack([at, at]))
+    np.testing.assert_allclose(batch[1], expected, rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "xla"])
+def test_forward_mode_says_what_to_take(backend):
+    vertices = as_jax(PAIR, "float32")
+    small = lambda v: self_intersection_penalty(v, FACES, rays=8, backend=backend)  # noqa: E731
+    summed = lambda v: jax.lax.scan(lambda c, _: (c + small(v), None), 0.0, length=2)[0]  # noqa: E731
+    calls = (
+        lambda: jax.jvp(small, (vertices,), (vertices,)),
+        lambda: jax.jit(lambda v: jax.jvp(small, (v,), (v,)))(vertices),
+        lambda: jax.jacfwd(lambda t: small(vertices + t))(0.0),
+        lambda: jax.linearize(small, vertices)[1](vertices),
+        lambda: jax.jvp(summed, (vertices,), (vertices,)),
+    )
+    for call in calls if backend == "numpy" else calls[:1]:
+        with pytest.raises(TypeError, match=r'no forward mode .*options=dict\(jac="bwd"\)'):
+            call()
+    # Reverse mode passes through all that forward mode does not.
+    gradient = jax.grad(small)(vertices)
+    (linear,) = jax.linear_transpose(jax.linearize(small, vertices)[1], vertices)(jnp.ones(()))
+    np.testing.assert_array_equal(linear, gradient)
+    if backend == "numpy":
+        np.testing.assert_array_equal(jax.grad(jax.checkpoint(small))(vertices), gradient)
+        np.testing.assert_allclose(jax.grad(summed)(vertices), 2 * gradient, rtol=1e-6)

@@ -16,11 +16,11 @@ from helpers import (
     sampling,
     sphere,
 )
-from helpers_penalty import PAIR, as_jax, loss
+from helpers_penalty import FACES, PAIR, as_jax, loss
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spt_jax import self_intersection_penalty
+from spt_jax import host, penalty, self_intersection_penalty
 from spt_jax.overlap.measure import measure
 
 
@@ -95,11 +95,51 @@ def test_extreme_scales(x64):
         np.testing.assert_allclose(scaled_gradient / scale / scale, gradient, atol=1e-12)
 
 
-def test_overflow_is_nan_and_no_crash(dtype):
-    huge = as_jax(PAIR, dtype) * np.asarray(1e30 if dtype == np.float32 else 1e307, dtype)
-    value, gradient = jax.value_and_grad(loss)(huge)
-    assert not value < np.inf  # too large for the dtype
-    assert not np.isnan(gradient).any()
+@pytest.mark.parametrize("rays", ["auto", 32])
+def test_what_the_dtype_cannot_hold_is_nan_or_zero_with_no_gradient(dtype, rays):
+    """Overflow is NaN; an underflowing value has no gradient, though that would not underflow."""
+    limits = np.finfo(dtype)
+    largest, least = float(limits.max) ** 0.34, float(limits.tiny) ** 0.34
+    run = jax.value_and_grad(lambda v: self_intersection_penalty(v, FACES, rays=rays))
+    for step in (run, jax.jit(run)):
+        for scale in (largest, 10 * largest):
+            value, gradient = step(as_jax(PAIR, dtype) * np.asarray(scale, dtype))
+            assert np.isnan(value) and not np.abs(gradient).any()
+        for scale in (0.5 * least, 1e-3 * least):
+            value, gradient = step(as_jax(PAIR, dtype) * np.asarray(scale, dtype))
+            assert (value > 0) == bool(np.abs(gradient).any())
+        # In float64 the cubes are no numbers: what cannot be measured is NaN.
+        assert value == 0 or (dtype == np.float64 and np.isnan(value))
+        value, gradient = step(as_jax(PAIR, dtype) * np.asarray(min(0.05 * largest, 1e98), dtype))
+        assert np.isfinite(value) and value > 0 and np.abs(gradient).any()
+
+
+@pytest.mark.parametrize("volume", [-1.2e-18, -0.0, 1e-320])
+def test_a_volume_below_rounding_is_zero_and_has_no_gradient(monkeypatch, volume):
+    class Found:
+        def __init__(self):
+            self.volume = volume
+
+        def gradient(self, *_):
+            return np.ones(PAIR[0].shape)
+
+    monkeypatch.setattr(penalty, "measure", lambda *_: Found())
+    value, gradient = jax.value_and_grad(loss)(as_jax(PAIR, "float32") + 0.3)
+    assert value == 0 and not np.signbit(value) and not np.abs(gradient).any()
+    host.forget()
+
+
+@pytest.mark.parametrize("rays", ["auto", (64, 64)])
+def test_faces_listed_twice_count_by_their_winding_number(dtype, rays):
+    """w is 2 inside, so w (w - 1) / 2 is 1: the solid, and its derivative, once."""
+    vertices, faces = moved(box((1.0, 2.0, 0.5)), random_rotation(np.random.default_rng(1)))
+    twice = np.concatenate([faces, faces])
+    run = jax.value_and_grad(lambda v: self_intersection_penalty(v, twice, rays=rays))
+    value, gradient = run(jnp.asarray(vertices, dtype))
+    assert float(value) == pytest.approx(1.0, rel=1e-5 if rays == "auto" else 0.05)
+    # Of a volume V: stretched by s about the centre it grows with 3 V.
+    stretched = float((gradient * vertices.astype(dtype)).sum())
+    assert stretched == pytest.approx(3.0, rel=1e-5 if rays == "auto" else 0.05)
 
 
 def test_meshes_without_triangles_or_extent_are_free():

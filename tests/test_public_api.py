@@ -25,6 +25,7 @@ NAMES = [
     "between_groups",
     "check_mesh",
     "classify_vertices",
+    "clear_caches",
     "fit_people",
     "fit_pose",
     "intersection_report",

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spt_jax import host
-from spt_jax.recent import Recent
+from spt_jax import host, host_side
+from spt_jax.recent import _ENTRY_BYTES, Recent
 
 FACES = np.array([[0, 1, 2], [0, 2, 1]], np.int32)
 measured = []
@@ -83,33 +83,35 @@ def test_what_differs_in_anything_is_measured():
 
 def test_results_cannot_be_changed_through_what_was_returned():
     (one,) = some(1)
-    results = ((), "float32"), ((3, 3), "float32")
-    entry = host._host_entry(twice, None, results, ((1, 3, 3), "float32"), ((1, 2, 3), "int32"))
-    pieces = (np.asarray(one).ravel(),), (FACES.ravel(),)
+    work = host_side.Work(twice, None, (((), "float32"), ((3, 3), "float32")))
     for _ in range(2):
-        _, found = entry(*pieces)
+        _, found = host_side.measured(work, np.asarray(one)[None], FACES[None])
         np.testing.assert_array_equal(found[0], 2 * one)
         found[:] = 7.0
     assert len(measured) == 1
 
 
-def remember(recent, vertices, faces):
+# Vertices, results, and what Python keeps for an entry.
+ENTRY = 144 + _ENTRY_BYTES
+
+
+def remember(recent, vertices, faces, asked="doubled"):
     def measure(meshes):
         measured.extend(meshes)
         return [(2 * v,) for v, _ in meshes]
 
-    return recent.results("doubled", [(v, recent.faces(faces)) for v in vertices], measure)
+    return recent.results(asked, [(v, recent.faces(faces)) for v in vertices], measure)
 
 
 def test_memory_is_bounded_and_the_oldest_goes_first(rng):
-    recent = Recent(most_bytes=10 * 144)  # vertices and results of ten meshes
+    recent = Recent(most_bytes=10 * ENTRY)
     meshes = rng.normal(size=(12, 3, 3))
     for mesh in meshes[:10]:
         remember(recent, [mesh], FACES)
     remember(recent, meshes[:1], FACES)  # used again, so not the oldest any more
     assert len(measured) == 10
     remember(recent, meshes[10:], FACES)
-    assert recent._bytes == 10 * 144
+    assert recent._bytes == 10 * ENTRY
     remember(recent, [meshes[0], *meshes[3:]], FACES)
     assert len(measured) == 12
     remember(recent, meshes[1:2], FACES)
@@ -126,7 +128,7 @@ def test_a_few_lists_of_faces_and_only_their_results(rng):
     assert recent.faces(lists[0]).dtype == np.int64
     for faces in lists:
         remember(recent, [mesh], faces)
-    assert len(recent._results) == 2 and recent._bytes == 288
+    assert len(recent._results) == 2 and recent._bytes == 2 * ENTRY
     remember(recent, [mesh], lists[2])
     assert len(measured) == 3
     remember(recent, [mesh], lists[0])
@@ -138,3 +140,18 @@ def test_larger_than_the_memory_is_not_kept(rng):
     mesh = rng.normal(size=(1, 3, 3))
     np.testing.assert_array_equal(remember(recent, mesh, FACES)[0][0], 2 * mesh[0])
     assert recent._bytes == 0 and not recent._results
+
+
+def test_a_few_questions_and_only_their_results(rng):
+    """Options may hold megabytes: a loop that asks with new ones each time keeps few of them."""
+    recent = Recent(most_asked=2)
+    (mesh,) = rng.normal(size=(1, 3, 3))
+    for asked in ("one", "two", "one", "three"):
+        remember(recent, [mesh], FACES, asked)
+    assert len(measured) == 3
+    assert list(recent._asked) == ["one", "three"]
+    assert len(recent._results) == 2 and recent._bytes == 2 * ENTRY
+    remember(recent, [mesh], FACES, "two")
+    assert len(measured) == 4
+    recent.forget_all()
+    assert not recent._asked and not recent._faces and recent._bytes == 0

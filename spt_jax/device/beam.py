@@ -60,13 +60,13 @@ class Aims(NamedTuple):
             ladder, in parts that add up to them.
     """
 
-    direction: Float[Array, "*D 3"]
-    outline: Float[Array, "*D 2 3"]
-    frame: Float[Array, "*D 3 S 3 P"]
+    direction: Float[Array | np.ndarray, "*D 3"]
+    outline: Float[Array | np.ndarray, "*D 2 3"]
+    frame: Float[Array | np.ndarray, "*D 3 S 3 P"]
 
 
 def aims(sampling: Sampling, dtype: np.dtype) -> Aims:
-    """The directions of a sampling as arrays, for a loop over them."""
+    """The directions of a sampling as arrays of values, for a loop over them."""
     directions = [np.array(direction) for direction in sampling.directions]
     outline = np.stack([screen_frame(direction)[:2] for direction in directions])
     turned = not isinstance(sampling.rays, tuple)
@@ -81,7 +81,7 @@ def aims(sampling: Sampling, dtype: np.dtype) -> Aims:
             parts.append(part)
             frames = frames - part
     arrays = np.stack(directions), outline, np.stack(parts, axis=-1)
-    return Aims(*(jnp.asarray(array, dtype) for array in arrays))
+    return Aims(*(array.astype(dtype) for array in arrays))
 
 
 def most_pixels(rays: int | tuple[int, int]) -> tuple[int, int]:

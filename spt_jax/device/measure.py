@@ -6,13 +6,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.device.exclusions import find_rims, which_count
+from spt_jax.device.beam import Aims
+from spt_jax.device.exclusions import Judge, find_rims, which_count
 from spt_jax.device.gradient import add_codes, boundary_gradient
 from spt_jax.device.levels import Intervals, kept_only
 from spt_jax.device.settings import Xla
 from spt_jax.device.strips import Ray, Usage, over_strips
-from spt_jax.overlap.exclusions import NOTHING, Exclusions
-from spt_jax.overlap.measure import Sampling
+from spt_jax.overlap.rays.beam import Rays
 
 
 class Wants(NamedTuple):
@@ -49,32 +49,32 @@ def nothing_found(vertices: Float[Array, "V 3"]) -> Found:
 def cast_beams(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
-    sampling: Sampling,
+    rays: Rays,
+    aimed: Aims,
     settings: Xla,
     wants: Wants,
-    exclusions: Exclusions = NOTHING,
+    judge: Judge | None = None,
 ) -> tuple[Found, Usage, Bool[Array, ""]]:
     """Every beam of the sampling through one mesh; twice where something does not count.
 
     Args:
         vertices, faces: finite, and in range.
-        sampling: rays and directions.
+        rays: how many.
+        aimed: their directions.
         settings: of the room.
         wants: what to find.
-        exclusions: what does not count.
+        judge: tells what does not count; None: everything does.
 
     Returns:
         What was found, what it took, and whether all of it was measured: where it was not, nothing
         of it can be used.
     """
     counted = None
-    if exclusions.any:
-        rims = find_rims(exclusions, vertices, faces)
-        overlapped = _overlapped(vertices, faces, sampling, settings)
+    if judge is not None:
+        rims = find_rims(judge, vertices, faces)
+        overlapped = _overlapped(vertices, faces, rays, aimed, settings)
         may_count = rims.may_count(faces, overlapped)
-        counted = functools.partial(
-            which_count, exclusions, faces=faces, rims=rims, may_count=may_count
-        )
+        counted = functools.partial(which_count, judge, faces=faces, rims=rims, may_count=may_count)
 
     def add(found: Found, intervals: Intervals, ray: Ray) -> Found:
         if counted is not None:
@@ -89,15 +89,15 @@ def cast_beams(
         return found
 
     start = nothing_found(vertices)
-    found, usage, usable = over_strips(vertices, faces, sampling, settings, add, start)
-    return found._replace(volume=found.volume / len(sampling.directions)), usage, usable
+    found, usage, usable = over_strips(vertices, faces, rays, aimed, settings, add, start)
+    return found._replace(volume=found.volume / len(aimed.direction)), usage, usable
 
 
-def _overlapped(vertices, faces, sampling, settings) -> Bool[Array, "V"]:
+def _overlapped(vertices, faces, rays, aimed, settings) -> Bool[Array, "V"]:
     """The corners of all triangles at which rays see an overlap."""
 
     def add(codes, intervals: Intervals, ray: Ray):
         return add_codes(codes, faces, intervals)
 
     start = jnp.zeros(len(vertices), jnp.int32)
-    return over_strips(vertices, faces, sampling, settings, add, start)[0] > 0
+    return over_strips(vertices, faces, rays, aimed, settings, add, start)[0] > 0

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.device.arrays import last_within
-from spt_jax.device.beam import Aims, Screen, aim, aims
+from spt_jax.device.beam import Aims, Screen, aim
 from spt_jax.device.crossings import (
     DEPTH_STEPS,
     Rows,
@@ -19,7 +19,7 @@ from spt_jax.device.crossings import (
 )
 from spt_jax.device.levels import Intervals, find_overlaps, most_levels, thickness
 from spt_jax.device.settings import Room, Xla, known, room
-from spt_jax.overlap.measure import Sampling
+from spt_jax.overlap.rays.beam import Rays
 
 Sums = TypeVar("Sums")
 
@@ -65,7 +65,8 @@ class Ray(NamedTuple):
 def over_strips(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
-    sampling: Sampling,
+    rays: Rays,
+    aimed: Aims,
     settings: Xla,
     add: Callable[[Sums, Intervals, Ray], Sums],
     sums: Sums,
@@ -74,7 +75,8 @@ def over_strips(
 
     Args:
         vertices, faces: finite, and in range.
-        sampling: rays and directions.
+        rays: how many.
+        aimed: their directions.
         settings: of the room.
         add: gives the sums with a strip's intervals.
         sums: before any of them.
@@ -82,15 +84,15 @@ def over_strips(
     Returns:
         The sums, what of the room was used, and whether all of the rays had room.
     """
-    rays = known(sampling.rays)
+    rays = known(rays)
     space = room(settings, rays)
-    aimed = aims(sampling._replace(rays=rays), vertices.dtype)
+    directions = jnp.asarray(aimed.direction)
 
     def along(state, one: Aims):
         sums, usage, usable = state
         screen = aim(vertices, one, rays)
         rows = cut_by_rows(screen, faces, space.rows)
-        ray = Ray(one.direction, aimed.direction, screen.pixel[0] * screen.pixel[1])
+        ray = Ray(jnp.asarray(one.direction), directions, screen.pixel[0] * screen.pixel[1])
         num_rows = jnp.minimum(screen.shape[0], space.rows)
 
         def next_strip(state):

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import as_directions, as_mesh, as_rays
-from spt_jax.device.backend import usage_on_device
+from spt_jax.bounded_jit import BoundedJit
+from spt_jax.device.backend import Program, Task, as_task, usage_on_device
 from spt_jax.device.settings import Room, Xla, room
 from spt_jax.device.strips import Usage
 from spt_jax.overlap.measure import Sampling
@@ -46,13 +46,13 @@ def device_usage(
         100 True
     """
     vertices, faces = as_mesh(vertices, faces)
-    settings = settings or Xla()
-    sampling = Sampling(as_rays(rays), as_directions(directions))
-    return _usage(settings, sampling, vertices, faces), room(settings, sampling.rays)
+    program = Program(settings or Xla(), as_rays(rays))
+    task = as_task(program, Sampling(program.rays, as_directions(directions)), vertices.dtype)
+    return _usage(program, vertices, faces, task.tables), room(program.settings, program.rays)
 
 
-def _usage_of(settings, sampling, vertices, faces):
-    return usage_on_device(vertices, faces, settings, sampling)
+def _usage_of(program, vertices, faces, tables):
+    return usage_on_device(vertices, faces, Task(program, tables))
 
 
-_usage = jax.jit(_usage_of, static_argnums=(0, 1))
+_usage = BoundedJit(_usage_of)

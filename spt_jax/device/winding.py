@@ -45,21 +45,25 @@ _THINNEST = 1e-7
 _MOST_RUNS, _MOST_PAIRS = 1 << 16, 1 << 17
 
 
+def generic_frames(directions: Directions) -> Float[np.ndarray, "D 3 3"]:
+    """The frames of rays along each direction, and along two of our own."""
+    rows = [*(np.array(direction) for direction in directions), *_SPARE]
+    return np.stack([_generic_frame(row) for row in rows])
+
+
 def vertex_labels(
-    vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], directions: Directions
+    vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], frames: Float[Array, "D 3 3"]
 ) -> Int[Array, "V"]:
     """The class sign(w_out) of every vertex: 0 on V_0, +1 on V_out, -1 on V_in.
 
-    The first direction serves all vertices; the next ones, and two of our own, those whose ray met
-    a hole. A vertex that no direction decides is 0, and so is one that no triangle uses.
+    The first of the frames (`generic_frames`) serves all vertices; the next ones those whose ray
+    met a hole. A vertex that none decides is 0, and so is one that no triangle uses.
     """
-    rows = [*(np.array(direction) for direction in directions), *_SPARE]
-    frames = jnp.asarray(np.stack([_generic_frame(row) for row in rows]), vertices.dtype)
     used = jnp.zeros(len(vertices), jnp.int32).at[faces.reshape(-1)].max(1) > 0
 
     def more(state):
         turn, _, undecided = state
-        return (turn < len(rows)) & undecided.any()
+        return (turn < len(frames)) & undecided.any()
 
     def look(state):
         turn, label, undecided = state

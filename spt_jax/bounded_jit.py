@@ -1,0 +1,54 @@
+"""`jax.jit` that forgets: programs of shapes that are no longer asked for are given back."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+# How many different calls are compiled before all are forgotten. A program takes 1 to 5 MB.
+_MOST = 64
+
+
+class BoundedJit:
+    """A jitted function that starts anew after so many different calls.
+
+    JAX keeps 4,096 programs of a function, or for ever what other caches refer to: some
+    gigabytes where every call brings another shape.
+
+    Args:
+        function: its first argument is static, all others are arrays.
+        most: kinds of calls that are kept; calls of one kind differ in values alone.
+    """
+
+    def __init__(self, function: Callable[..., Any], most: int = _MOST):
+        self._jitted: Any = jax.jit(function, static_argnums=0)
+        self._most = most
+        self._lock = threading.Lock()
+        self._seen: set[Any] = set()
+
+    def __call__(self, static: Any, *arrays: Any) -> Any:
+        """The function of its arguments."""
+        leaves, structure = jax.tree.flatten(arrays)
+        # Under a trace, nothing is compiled here.
+        if not any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *leaves)):
+            kind = static, structure, *((leaf.shape, leaf.dtype) for leaf in leaves)
+            with self._lock:
+                if kind not in self._seen and len(self._seen) >= self._most:
+                    self._forget()
+                self._seen.add(kind)
+        return self._jitted(static, *arrays)
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def clear(self) -> None:
+        """Forget all programs."""
+        with self._lock:
+            self._forget()
+
+    def _forget(self) -> None:
+        self._seen.clear()
+        self._jitted.clear_cache()

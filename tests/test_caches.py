@@ -1,0 +1,91 @@
+"""What is kept between calls: bounded whatever changes, and given back when that is asked for."""
+
+import gc
+import resource
+import sys
+import weakref
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import box, join
+
+from spt_jax import (
+    RestSurface,
+    classify_vertices,
+    clear_caches,
+    host_side,
+    self_intersection_penalty,
+)
+from spt_jax.bounded_jit import BoundedJit
+from spt_jax.overlap.triangles import manifold
+
+PAIR = join(box(), box(center=(0.6, 0.13, 0.07)))
+
+
+def test_a_bounded_jit_forgets_and_still_answers():
+    traced = []
+
+    def scaled(factor, values):
+        traced.append(values.shape)
+        return factor * values
+
+    bounded = BoundedJit(scaled, most=3)
+    for count in (1, 2, 3, 3, 2, 1):
+        assert bounded(2.0, jnp.ones(count)).sum() == 2 * count
+    assert len(traced) == 3 == len(bounded) == bounded._jitted._cache_size()
+    bounded(2.0, jnp.ones(4))
+    assert len(bounded) == 1 == bounded._jitted._cache_size()
+    assert bounded(3.0, jnp.ones(4)).sum() == 12 and len(bounded) == 2
+    assert jax.jit(lambda x: bounded(2.0, x))(jnp.ones(5)).sum() == 10 and len(bounded) == 2
+    bounded.clear()
+    assert len(bounded) == 0 and bounded(2.0, jnp.ones(1))[0] == 2
+
+
+def test_new_values_of_every_option_keep_a_bounded_number_of_things(rng):
+    """Directions, groups, distances, faces and rest surfaces, new in every call."""
+    vertices = jnp.asarray(PAIR[0], "float32")
+    kept = weakref.WeakSet()
+    for k in range(40):
+        faces = np.roll(PAIR[1], k, axis=0)
+        rest = RestSurface(PAIR[0] * (1 + k / 100), faces, distance=0.01)
+        kept.add(rest)
+        self_intersection_penalty(
+            vertices,
+            faces,
+            directions=rng.normal(size=(3, 3)),
+            face_groups=np.roll(np.repeat([0, 1], 12), k),
+            ignore_groups=((0, 0),),
+            folds=rest,
+            margin=1e-3 * k,
+        )
+        classify_vertices(vertices, faces, folds=rest)
+    gc.collect()
+    assert len(kept) <= 16
+    recent = host_side._recent
+    assert len(recent._asked) <= 8 and len(recent._faces) <= 4 and len(recent._results) <= 8
+    clear_caches()
+    assert len(kept) <= 1  # the last one is this function's own
+    assert not recent._results and not recent._faces and len(manifold._manifolds) == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_does_not_grow_with_the_number_of_calls(rng):
+    """1.3 MB a call were kept once; here 120 calls may keep 10 MB."""
+    vertices = jnp.asarray(PAIR[0], "float32")
+
+    def calls(count):
+        for _ in range(count):
+            options = {"rays": 8, "directions": rng.normal(size=(3, 3))}
+            jax.value_and_grad(lambda v: self_intersection_penalty(v, PAIR[1], **options))(vertices)  # noqa: B023
+
+    def resident():
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * resource.getpagesize()
+
+    calls(30)
+    before = resident()
+    calls(120)
+    assert resident() - before < 10e6
