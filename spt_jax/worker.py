@@ -8,27 +8,32 @@ connection closes or its parent is gone.
 import copyreg
 import functools
 import io
+import json
 import os
 import pickle
 import socket
-import struct
 import subprocess
 import sys
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
+from spt_jax.frames import BrokenError, Frames
 from spt_jax.surface_paths import SurfacePaths, surface_paths
 
 # function(vertices, faces, options) -> one array per result, as `host.HostFunction`.
 Function = Callable[..., tuple[np.ndarray, ...]]
 Mesh = tuple[np.ndarray, np.ndarray]
 
-# Seconds that a message may take to go through.
-_PATIENCE = 20.0
+# Seconds after which a worker that has not answered is given up. Nobody waits so long: it is only
+# not asked until then. Starting it, and unpacking a rest surface, take seconds on a busy machine.
+_GIVEN_UP = 60.0
+
+# Seconds that are spent on telling it what its work is.
+_TOLD = 0.1
 
 # How many functions with their options a worker remembers.
 _REMEMBERED = 8
@@ -39,18 +44,20 @@ _REMEMBERED = 8
 _KEPT_BYTES = str(64 << 20)
 
 _BOOT = """
-import signal, sys
+import json, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_IGN)
-from multiprocessing.connection import Connection
-connection = Connection(int(sys.argv[1]))
-sys.path[:], parent = connection.recv()
+sys.path[:] = json.loads(sys.argv[2])
 from spt_jax.worker import serve
-serve(connection, parent)
+serve(int(sys.argv[1]), int(sys.argv[3]))
 """
 
 
 class LostError(Exception):
-    """A worker is gone, or answers nonsense."""
+    """A worker is gone, or answers nonsense, or is late for ever."""
+
+
+class LateError(Exception):
+    """A worker has not answered in time, and may yet."""
 
 
 class Worker:
@@ -58,10 +65,6 @@ class Worker:
 
     def __init__(self):
         ours, theirs = socket.socketpair()
-        # One that has stopped in the middle of a message must not stop us, too.
-        seconds = struct.pack("ll", *divmod(int(1e6 * _PATIENCE), 1_000_000))
-        for limit in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
-            ours.setsockopt(socket.SOL_SOCKET, limit, seconds)
         environment = os.environ | {
             "JAX_PLATFORMS": "cpu",  # imported, never used; must not reserve an accelerator
             "OMP_NUM_THREADS": "1",
@@ -69,83 +72,104 @@ class Worker:
             "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
             "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
         }
+        own = str(theirs.fileno()), json.dumps([str(path) for path in sys.path]), str(os.getpid())
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _BOOT, str(theirs.fileno())],
+                [sys.executable, "-c", _BOOT, *own],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=environment,
             )
-        self._connection = Connection(ours.detach())
-        self._pending = 1  # answers that are on their way: the first says that it is there
+        self._frames = Frames(ours)
+        # Answers that are on their way, and when each is given up. The first says that it is there.
+        self._awaited = {0: time.monotonic() + _GIVEN_UP}
         self._known: OrderedDict[bytes, int] = OrderedDict()
         self._faces: np.ndarray | None = None
         self._number = 0
-        self._send(sys.path, os.getpid())
 
     def is_ready(self, work: bytes) -> bool:
-        """Whether it can measure now; if only for want of knowing the work, it is told."""
-        while self._pending and self._connection.poll(0):
-            self._receive(0.0)
-            self._pending -= 1
-        if self._pending:
+        """Whether it can measure now; if only for want of knowing the work, it is told.
+
+        Raises:
+            LostError: it is gone, or has not answered for a minute.
+        """
+        try:
+            while self._awaited:
+                self._take(0.0)  # late answers are nobody's any more
+        except TimeoutError:
+            if min(self._awaited.values()) < time.monotonic():
+                raise LostError from None
             return False
         if work in self._known:
             self._known.move_to_end(work)
             return True
-        if len(self._known) == _REMEMBERED:
-            self._tell("forget", self._known.popitem(last=False)[1])
-        self._number += 1
-        self._known[work] = self._number
-        # Options may take a second to unpack, such as the distances of a rest surface.
-        self._tell("learn", self._number, work)
+        try:
+            if len(self._known) == _REMEMBERED:
+                self._ask(_TOLD, "forget", self._known.popitem(last=False)[1])
+            # Options may take a second to unpack, such as the distances of a rest surface.
+            self._known[work] = self._number + 1
+            self._ask(_TOLD, "learn", self._number + 1, work)
+        except TimeoutError:
+            pass  # the rest is sent when it takes more
         return False
 
     def measure(self, work: bytes, mesh: Mesh, seconds: float) -> tuple[np.ndarray, ...]:
-        """What the function returns for one mesh, when it is ready."""
+        """What the function returns for one mesh, when it is ready.
+
+        Raises:
+            LateError: not within so many seconds.
+            LostError: it is gone, or could not.
+        """
         vertices, faces = mesh
         fresh = None if faces is self._faces else faces
-        self._send("measure", self._known[work], vertices, fresh)
-        self._faces = faces
-        return self._receive(seconds)
+        deadline = time.monotonic() + seconds
+        self._faces = faces  # what is sent late is sent all the same
+        try:
+            number = self._ask(seconds, "measure", self._known[work], vertices, fresh)
+            while True:
+                answered, answer = self._take(max(0.0, deadline - time.monotonic()))
+                if answered == number:
+                    return answer
+        except TimeoutError:
+            raise LateError from None
 
     def close(self) -> None:
         """End it, whatever it does: it has nothing to lose."""
-        self._connection.close()
+        self._frames.close()
         self._process.kill()
         self._process.wait()
 
     def leave_to_parent(self) -> None:
         """In a forked child: the worker is the parent's, and must see when that is gone."""
-        self._connection.close()
+        self._frames.close()
         self._process.returncode = 0  # nothing to wait for here
 
-    def _tell(self, *message: Any) -> None:
-        self._send(*message)
-        self._pending += 1
-
-    def _send(self, *message: Any) -> None:
+    def _ask(self, seconds: float, *message: Any) -> int:
+        self._number += 1
+        self._awaited[self._number] = time.monotonic() + _GIVEN_UP
         try:
-            self._connection.send(message)
-        except (OSError, ValueError) as error:
+            self._frames.send(self._number, message, seconds)
+        except BrokenError as error:
             raise LostError from error
+        return self._number
 
-    def _receive(self, seconds: float) -> Any:
+    def _take(self, seconds: float) -> tuple[int, Any]:
         try:
-            if not self._connection.poll(seconds):
-                raise LostError
-            good, answer = self._connection.recv()
+            number, (good, answer) = self._frames.receive(seconds)
+        except TimeoutError:
+            raise
         except Exception as error:  # whatever it sent
             raise LostError from error
-        if not good:
+        if not good or self._awaited.pop(number, None) is None:
             raise LostError
-        return answer
+        return number, answer
 
 
-def serve(connection: Connection, parent: int) -> None:
+def serve(descriptor: int, parent: int) -> None:
     """What a worker does until its parent is gone."""
+    frames = Frames(socket.socket(fileno=descriptor))
     works: dict[int, tuple[Function, Any]] = {}
     known_faces = np.zeros((0, 3), np.int64)
 
@@ -165,19 +189,21 @@ def serve(connection: Connection, parent: int) -> None:
 
     orders = {"forget": forget, "learn": learn, "measure": measure}
     try:
-        connection.send((True, None))
+        frames.send(0, (True, None), _GIVEN_UP)
         while True:
-            # A fork of the parent may hold the connection open when the parent is gone.
-            while not connection.poll(5.0):
+            try:
+                asked, (order, *arguments) = frames.receive(5.0)
+            except TimeoutError:
+                # A fork of the parent may hold the connection open when the parent is gone.
                 if os.getppid() != parent:
                     os._exit(0)
-            order, *arguments = connection.recv()
+                continue
             try:
                 answer = True, orders[order](*arguments)
             except Exception:  # too little memory, perhaps: for the parent to find out
                 answer = False, None
-            connection.send(answer)
-    except (OSError, EOFError):
+            frames.send(asked, answer, _GIVEN_UP)
+    except (BrokenError, TimeoutError, ValueError, TypeError):
         os._exit(0)  # at once: nothing here needs to be wound up
 
 

@@ -5,20 +5,23 @@ the cache, 10 to 50 us each. Each gives Python's lock away and has to win it bac
 threads that hand-over costs as much as the call: for 30,000 elements, two threads that do nothing
 but `np.add`, `take` or `bincount` are together 0.9 to 1.2 times as fast as one, and two threads
 that measure bodies 0.8 to 1.1 times. Arrays ten times as large would hide it and miss the cache.
-Processes share no lock. Whatever goes wrong with one, its work is done here.
+Processes share no lock.
+
+Whatever goes wrong with one, its work is done here: at once where it is gone or could not, and
+otherwise when it takes much longer than such work usually does, be it stopped, starved or slow.
 """
 
 import os
 import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
 
-from spt_jax.worker import Function, LostError, Mesh, Worker, can_start, packed
+from spt_jax.worker import Function, LateError, LostError, Mesh, Worker, can_start, packed
 
 # Starting one takes a second of a core, and 190 MB while it is there: not before batches have
 # taken as long, and not for every core of a large machine.
@@ -31,10 +34,39 @@ _WORTH_SHARING = 10_000
 # Triangles of one mesh for it to be measured elsewhere.
 _WORTH_ASKING = 2_000
 
-# A worker that answers later than this is lost: seconds, and microseconds for each triangle, a
-# hundred times what is usual. After so many losses there are no more workers.
-_PATIENCE = 20.0, 100.0
-_MOST_LOSSES = 3
+# How long a worker may take for a mesh: seconds, and times what it usually takes. Before anything
+# is known of it, seconds a triangle: a hundred times what a body takes.
+_PATIENCE = 0.1, 8.0
+_FIRST_GUESS = 1e-4
+
+# After so many losses within so many seconds there are no more workers, until they are past.
+_MOST_LOSSES, _LOSSES_COUNT = 3, 600.0
+
+
+class Pace:
+    """How long work usually takes: seconds a triangle, for the last kinds of it."""
+
+    def __init__(self, kinds: int = 16):
+        self._kinds = kinds
+        self._lock = threading.Lock()
+        self._usual: OrderedDict[bytes, float] = OrderedDict()
+
+    def note(self, work: bytes, size: int, seconds: float) -> None:
+        """Learn from one mesh of so many triangles."""
+        found = seconds / max(size, 1)
+        with self._lock:
+            usual = self._usual.get(work, found)
+            # One that took very long says little of what is usual.
+            self._usual[work] = usual + 0.2 * (min(found, 4 * usual) - usual)
+            self._usual.move_to_end(work)
+            while len(self._usual) > self._kinds:
+                self._usual.popitem(last=False)
+
+    def patience(self, work: bytes, size: int) -> float:
+        """Seconds after which it is done elsewhere."""
+        with self._lock:
+            usual = self._usual.get(work, _FIRST_GUESS)
+        return _PATIENCE[0] + _PATIENCE[1] * usual * max(size, 1)
 
 
 class Workers:
@@ -44,7 +76,9 @@ class Workers:
         self._lock = threading.Lock()
         self._free: list[Worker] = []
         self._number = 0
-        self._losses = 0
+        self._losses: deque[float] = deque(maxlen=_MOST_LOSSES)
+        self._closed = False
+        self._pace = Pace()
         self._spent = 0.0
         self._at_work = 0
 
@@ -57,17 +91,19 @@ class Workers:
         try:
             size = len(mesh[1])
             work = packed(function, options) if not alone and size > _WORTH_ASKING else None
-            if work is not None:
-                patience = _PATIENCE[0] + 1e-6 * _PATIENCE[1] * size
-                for worker in self._ready(work, 1):
-                    try:
-                        found = worker.measure(work, mesh, patience)
-                    except LostError:
-                        self._drop(worker)
-                    else:
-                        self._release(worker)
-                        return found
-            return function(*mesh, options)
+            if work is None:
+                return function(*mesh, options)
+            for worker in self._ready(work, 1):
+                try:
+                    found = self._elsewhere(worker, work, mesh)
+                except LostError:
+                    self._drop(worker)
+                except LateError:
+                    self._release(worker)
+                else:
+                    self._release(worker)
+                    return found
+            return self._here(function, options, mesh, work)
         finally:
             with self._lock:
                 self._at_work -= 1
@@ -95,30 +131,31 @@ class Workers:
                     return
                 yield i
 
-        def share(worker: Worker, work: bytes, seconds: float) -> None:
+        def share(worker: Worker, work: bytes) -> None:
             try:
                 for i in taken():
                     lost.append(i)
-                    found[i] = worker.measure(work, meshes[i], seconds)
+                    found[i] = self._elsewhere(worker, work, meshes[i])
                     lost.remove(i)
             except LostError:
                 self._drop(worker)
+            except LateError:
+                self._release(worker)
             else:
                 self._release(worker)
 
         begin = time.perf_counter()
         size = sum(len(faces) for _, faces in meshes)
         work = packed(function, options) if size > _WORTH_SHARING else None
-        patience = _PATIENCE[0] + 1e-6 * _PATIENCE[1] * size
         try:
             if work is not None:
                 for worker in self._ready(work, len(meshes) - 1):
                     try:
-                        shares.append(executor().submit(share, worker, work, patience))
+                        shares.append(executor().submit(share, worker, work))
                     except RuntimeError:  # the interpreter is leaving and takes no more work
                         self._release(worker)
             for i in taken():
-                found[i] = function(*meshes[i], options)
+                found[i] = self._here(function, options, meshes[i], work)
         finally:
             left.clear()
             for ended in shares:
@@ -128,19 +165,40 @@ class Workers:
             found[i] = function(*meshes[i], options)
         return found
 
-    def close(self) -> None:
-        """End all that are free, and start no more."""
+    def release(self) -> None:
+        """End all that are free; batches that are worth it start others."""
         with self._lock:
             workers, self._free = self._free, []
-            self._losses = _MOST_LOSSES
+            self._number -= len(workers)
+            self._spent = 0.0
         for worker in workers:
             worker.close()
+
+    def close(self) -> None:
+        """End all that are free, and start no more."""
+        self._closed = True
+        self.release()
 
     def leave_to_parent(self) -> None:
         """In a forked child: begin anew."""
         for worker in self._free:
             worker.leave_to_parent()
         self.__init__()
+
+    def _elsewhere(self, worker: Worker, work: bytes, mesh: Mesh) -> tuple[np.ndarray, ...]:
+        size, begin = len(mesh[1]), time.perf_counter()
+        found = worker.measure(work, mesh, self._pace.patience(work, size))
+        self._pace.note(work, size, time.perf_counter() - begin)
+        return found
+
+    def _here(
+        self, function: Function, options: Hashable, mesh: Mesh, work: bytes | None
+    ) -> tuple[np.ndarray, ...]:
+        begin = time.perf_counter()
+        found = function(*mesh, options)
+        if work is not None:
+            self._pace.note(work, len(mesh[1]), time.perf_counter() - begin)
+        return found
 
     def _ready(self, work: bytes, most: int) -> list[Worker]:
         with self._lock:
@@ -159,13 +217,17 @@ class Workers:
 
     def _start(self) -> None:
         most = min(usable_cores() - 1, _MOST_WORKERS)
-        if self._spent < _WORTH_STARTING or self._losses >= _MOST_LOSSES or not can_start():
+        if self._closed or self._spent < _WORTH_STARTING or not can_start():
             return
+        if len(self._losses) == _MOST_LOSSES:
+            if time.monotonic() - self._losses[0] < _LOSSES_COUNT:
+                return
+            self._losses.clear()
         while self._number < most:
             try:
                 self._free.append(Worker())
-            except (OSError, LostError):
-                self._losses = _MOST_LOSSES
+            except OSError:
+                self._losses.append(time.monotonic())
                 return
             self._number += 1
 
@@ -177,7 +239,7 @@ class Workers:
         worker.close()
         with self._lock:
             self._number -= 1
-            self._losses += 1
+            self._losses.append(time.monotonic())
 
 
 def usable_cores() -> int:

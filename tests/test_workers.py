@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 import warnings
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from spt_jax.penalty import _Options, _value_and_gradient_on_host
 from spt_jax.rest_surface import RestSurface
 
 SCRIPTS = Path(__file__).parent / "scripts"
-OPTIONS = _Options("volume", "boundary", "vertex", sampling("auto"), NOTHING, 1e-7, None)
+OPTIONS = _Options("volume", "boundary", "vertex", sampling("auto"), NOTHING, 1e-7)
 
 pytestmark = pytest.mark.skipif(not module.can_start(), reason="no workers on this system")
 
@@ -98,6 +99,14 @@ def test_same_bits_as_here_with_new_faces_and_options(pool, executor, monkeypatc
     assert len(answers) > before
 
 
+def test_released_workers_end_and_others_start(pool, executor):
+    worker = until_ready(pool)
+    pool.release()
+    assert worker._process.poll() is not None and pool._free == [] and pool._number == 0
+    assert until_ready(pool) is not worker
+    check(pool, executor, batch())
+
+
 def test_forgets_what_is_long_ago(pool, executor):
     for k in range(module._REMEMBERED + 2):
         options = OPTIONS._replace(sampling=sampling(8 + k))
@@ -106,17 +115,84 @@ def test_forgets_what_is_long_ago(pool, executor):
     check(pool, executor, batch(2), options)
 
 
-def test_one_that_dies_or_hangs_is_replaced_until_too_many_are_lost(pool, executor, monkeypatch):
-    monkeypatch.setattr(workers, "_PATIENCE", (0.2, 0.0))
-    monkeypatch.setattr(module, "_PATIENCE", 0.2)
-    for number, harm in enumerate((signal.SIGKILL, signal.SIGSTOP, signal.SIGKILL)):
+def test_one_that_dies_is_replaced_until_too_many_are_lost(pool, executor):
+    for number in range(3):
         worker = until_ready(pool)
-        worker._process.send_signal(harm)
+        worker._process.kill()
         check(pool, executor, batch())
         assert worker._process.poll() is not None  # not left behind
-        assert pool._losses == number + 1
+        assert len(pool._losses) == number + 1
     check(pool, executor, batch())
     assert pool._free == []
+    # Losses are not held against it for ever.
+    pool._losses = deque([-1e9, *pool._losses][:3], maxlen=3)
+    with pool._lock:
+        pool._start()
+    assert len(pool._free) == 1
+
+
+def test_one_that_is_stopped_is_not_waited_for_and_given_up_in_the_end(pool, executor, monkeypatch):
+    """What it was asked for is done here after much longer than usual; then it is not asked."""
+    worker = until_ready(pool)
+    check(pool, executor, batch())  # what is usual
+    assert pool._pace.patience(*kind_of(batch()[0])) < 60.0
+    answers = count_answers(worker, monkeypatch)
+    worker._process.send_signal(signal.SIGSTOP)
+    check(pool, executor, batch())
+    check(pool, executor, batch())
+    assert pool._free == [worker] and worker._awaited and answers == [] and not pool._losses
+    # An answer that comes late is nobody's, and the worker is as good as before.
+    worker._process.send_signal(signal.SIGCONT)
+    assert until_ready(pool) is worker and not worker._awaited
+    check(pool, executor, batch())
+    assert answers
+    worker._process.send_signal(signal.SIGSTOP)
+    check(pool, executor, batch())
+    worker._awaited = dict.fromkeys(worker._awaited, -1e9)  # as if a minute had passed
+    check(pool, executor, batch())
+    assert worker._process.poll() is not None and len(pool._losses) == 1
+
+
+def test_a_single_mesh_is_not_kept_waiting_either(pool, executor, monkeypatch):
+    monkeypatch.setattr(workers, "_WORTH_ASKING", 0)
+    worker = until_ready(pool)
+    check(pool, executor, batch())
+    worker._process.send_signal(signal.SIGSTOP)
+    pool._at_work = 1  # as if another thread were measuring
+    (mesh,) = batch(1)
+    value, _ = pool.measure_one(_value_and_gradient_on_host, OPTIONS, mesh)
+    assert value == _value_and_gradient_on_host(*mesh, OPTIONS)[0]
+    assert pool._free == [worker] and worker._awaited
+
+
+def test_one_without_memory_is_replaced(pool, executor):
+    """What it cannot do is done here."""
+    resource = pytest.importorskip("resource")
+    if not hasattr(resource, "prlimit"):
+        pytest.skip("no limits on other processes here")
+    worker = until_ready(pool)
+    resource.prlimit(worker._process.pid, resource.RLIMIT_AS, (1 << 20, 1 << 20))
+    vertices, faces = sphere(subdivisions=5)
+    check(pool, executor, [join((vertices, faces), (vertices * s + 0.4, faces)) for s in (1, 2)])
+    assert len(pool._losses) <= 1
+
+
+def test_patience_is_some_times_what_is_usual():
+    pace = workers.Pace(kinds=2)
+    for _ in range(20):
+        pace.note(b"body", 1000, 0.02)
+    usual = pace.patience(b"body", 1000)
+    assert 0.1 < usual < 0.5
+    pace.note(b"body", 1000, 100.0)  # one hiccup
+    assert pace.patience(b"body", 1000) < 2 * usual
+    assert pace.patience(b"other", 1000) > usual
+    for work in (b"one", b"two"):
+        pace.note(work, 10, 1.0)
+    assert len(pace._usual) == 2 and pace.patience(b"body", 1000) > 2 * usual
+
+
+def kind_of(mesh):
+    return module.packed(_value_and_gradient_on_host, OPTIONS), len(mesh[1])
 
 
 def test_errors_are_raised_here_and_leave_no_worker_busy(pool, executor):
@@ -175,4 +251,4 @@ def test_a_forked_child_leaves_them_to_its_parent(pool, executor):
     assert os.waitpid(child, 0)[1] == 0
     assert worker._process.poll() is None
     check(pool, executor, batch())
-    assert pool._losses == 0
+    assert not pool._losses
