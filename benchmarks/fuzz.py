@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import traceback
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -140,11 +141,11 @@ def _run(topic: Topic, settings: Settings, count: int | None, seconds: float) ->
             pipe.send(None)
             process.join()
 
-    drivers = [threading.Thread(target=drive) for _ in range(settings.processes)]
-    for driver in drivers:
-        driver.start()
-    for driver in drivers:
-        driver.join()
+    with ThreadPoolExecutor(settings.processes) as drivers:
+        for driver in [drivers.submit(drive) for _ in range(settings.processes)]:
+            driver.result()
+    if not cases or (count is not None and len(cases) < count):
+        raise RuntimeError(f"{count or 'some'} {topic} must be tried: got {len(cases)}.")
     return cases
 
 

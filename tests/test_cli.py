@@ -154,7 +154,14 @@ def test_interrupted_while_it_works(command, tmp_path, capsys, monkeypatch):
 def test_ctrl_c_ends_the_process_cleanly_in_the_middle_of_a_computation(tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "spt_jax", "demo", "--out", str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # What a shell runs in the background, and all that it starts, ignores Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     try:
         for _ in range(600):
             if out.exists():
