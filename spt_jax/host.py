@@ -67,7 +67,7 @@ def call_on_host(
     function: HostFunction,
     options: Hashable,
     results: tuple[ResultSpec, ...],
-    vertices: Float[Array, "*batch V 3"],
+    vertices: Float[Array | np.ndarray, "*batch V 3"],
     faces: Integer[Array | np.ndarray, "F 3"],
 ) -> tuple[Array, ...]:
     """Run a NumPy function once per mesh of the batch, in as many processes as there are cores.

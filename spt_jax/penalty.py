@@ -99,10 +99,12 @@ def self_intersection_penalty(
             prints how far off it is).
 
     Returns:
-        One number per mesh, in the vertices' dtype. NaN, with a zero gradient, where there is no
-        surface to measure: a vertex is not finite, a traced face is out of range, the mesh is
-        smaller than 1024 units in the last place of its coordinates, or so crumpled that more than
-        20 pairs of triangles to a triangle (and 2,000,000) are near each other.
+        One number per mesh, in the vertices' dtype. A volume that the dtype cannot tell from zero
+        is zero, with a zero gradient. NaN, with a zero gradient, where value or gradient are more
+        than the dtype can hold, or there is no surface to measure: a vertex is not finite, a traced
+        face is out of range, the mesh is smaller than 1024 units in the last place of its
+        coordinates, or so crumpled that more than 20 pairs of triangles to a triangle (and
+        2,000,000) are near each other.
 
     Raises:
         TypeError: vertices not float32 or float64; faces or groups not whole numbers; rays,
@@ -112,10 +114,13 @@ def self_intersection_penalty(
             faces; an unknown option.
 
     Differentiation: reverse mode (`jax.grad`, `jax.vjp`, `jac="bwd"` in optimistix) with respect to
-        vertices. The gradient is computed with the value and held fixed: in second derivatives
-        the penalty counts as linear. There is no forward mode. With a margin, every kind of
-        gradient is that of the moved surface, carried back to `vertices` by the chain rule. Inside
-        `jax.shard_map` pass it check_vma=False.
+        vertices. Forward mode (`jax.jvp`, `jax.jacfwd`, calling what `jax.linearize` returns) is
+        refused by name. The gradient is computed with the value and held fixed: in second
+        derivatives the penalty E counts as linear, so that the Hessian of f(E) is f''(E) g g^T with
+        g its gradient: 2 g g^T for its square, without f'(E) times the curvature of E itself. With
+        a margin, every kind of gradient is that of the moved surface, carried back to `vertices` by
+        the chain rule. A batch that is sharded over devices stays so; inside `jax.shard_map` pass
+        it check_vma=False. `jax.export` holds `backend="xla"` alone and refuses the others by name.
 
     Example:
         >>> import jax, trimesh

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -22,7 +23,7 @@ _REFUSAL = (
 )
 
 
-def refuse_forward(vertices: Float[Array, "*batch V 3"]) -> Float[Array, "*batch V 3"]:
+def refuse_forward(vertices: Float[Array | np.ndarray, "*batch V 3"]) -> Float[Array, "*batch V 3"]:
     """The same vertices, of which nothing that depends has a forward-mode derivative.
 
     The linear function that `jax.linearize` returns may be transposed, as optimistix does, and not
@@ -35,7 +36,7 @@ def refuse_forward(vertices: Float[Array, "*batch V 3"]) -> Float[Array, "*batch
 
 
 def with_slope(
-    vertices: Float[Array, "*batch V 3"],
+    vertices: Float[Array | np.ndarray, "*batch V 3"],
     value: Float[Array, "*batch"],
     gradient: Float[Array, "*batch V 3"],
 ) -> Float[Array, "*batch"]:

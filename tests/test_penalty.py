@@ -183,6 +183,18 @@ def test_faces_may_be_batched_by_vmap():
     np.testing.assert_allclose(both, jnp.stack([values, 8 * values], axis=1), rtol=0.02)
 
 
+def test_numpy_arrays_are_differentiated_as_they_are(dtype):
+    vertices = PAIR[0].astype(dtype)
+    value, gradient = jax.value_and_grad(loss)(as_jax(PAIR, dtype))
+    plain = jax.value_and_grad(loss)(vertices)
+    batch = jax.vmap(jax.value_and_grad(loss))(vertices[None])
+    assert plain[0] == value == batch[0][0] == loss(vertices)
+    np.testing.assert_array_equal(plain[1], gradient)
+    np.testing.assert_array_equal(batch[1][0], gradient)
+    square = jax.hessian(lambda t: loss(vertices + t) ** 2)(np.zeros((), dtype))
+    assert abs(square) < 1e-3  # moved as a whole
+
+
 def test_repeated_calls_are_traced_once():
     traces = 0
 
