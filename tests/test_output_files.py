@@ -241,7 +241,9 @@ def test_mesh_files_that_are_refused(tmp_path):
     with pytest.raises(ValueError, match="must hold triangles"):
         read_mesh(tmp_path / "a.obj")
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "p.ply")
-    with pytest.raises(ValueError, match=r"must hold triangles.*point cloud of 3 points.*reconstruct"):
+    with pytest.raises(
+        ValueError, match=r"must hold triangles.*point cloud of 3 points.*reconstruct"
+    ):
         read_mesh(tmp_path / "p.ply")
     (tmp_path / "n.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match=r"n\.off.*vertices must be finite.*vertex 1"):

@@ -187,7 +187,7 @@ def test_directions_agree_on_real_bodies():
     """At 512 x 512 the three directions against each other and against 2048 x 2048.
 
     Within 1 % where more than 100 cm^3 overlap; smaller overlaps, a few rays wide, scatter up to
-    4 %. benchmarks/quadrature.py prints the whole distribution over 50 frames.
+    4 %. `python -m benchmarks.exactness` prints how far rays are off on real bodies.
     """
     names = mocap().names
     frames = np.random.default_rng(0).permutation(len(names))[:14]
