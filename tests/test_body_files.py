@@ -347,6 +347,8 @@ def test_sizes_that_a_pickle_announces_are_not_believed(tmp_path, rng):
     nested = [0.0] * 10
     for _ in range(12):
         nested = [nested] * 10
+    endless = [0.0]
+    endless.append(endless)
     huge, lying = scipy.sparse.csc_matrix((2, 2)), scipy.sparse.csc_matrix(np.eye(3))
     huge._shape = (24, 10**13)
     lying.indptr = np.array([0, 10**12, 10**12, 3])
@@ -358,6 +360,7 @@ def test_sizes_that_a_pickle_announces_are_not_believed(tmp_path, rng):
         ),
         (_pickled(rng, J_regressor=lying), "J_regressor in .* other entries than it has"),
         (_pickled(rng, v_template=nested), "v_template in .* more entries than the limit"),
+        (_pickled(rng, v_template=endless), "v_template in .* more entries than the limit"),
         (header + b"(M\xff\xffM\xff\xfftU\x01b\x87R.", "rebuilt from nothing: got an announced"),
         (b"\x80\x02}r\xff\xff\xff\x7f.", "its reference 1 the number 2147483647"),
         (b"\x80\x04\x8e" + b"\xff" * 7 + b"\x0f" + b"x.", "model.pkl cannot be read"),

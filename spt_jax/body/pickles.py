@@ -238,16 +238,34 @@ def _dense(value: Any, max_bytes: int) -> np.ndarray:
     A list that holds another one ten times, which holds a third ten times, takes a few bytes in a
     pickle and any number of them as an array.
     """
-    left = [value]
-    entries = 0
-    while left:
-        item = left.pop()
-        if isinstance(item, (list, tuple)):
-            entries += len(item)
-            if 8 * entries > max_bytes:
-                raise ValueError("its lists hold more entries than the limit")
-            left += [inner for inner in item if isinstance(inner, (list, tuple))]
+    if 8 * _entries(value) > max_bytes:
+        raise ValueError("its lists hold more entries than the limit")
     return np.asarray(value)
+
+
+def _entries(value: Any) -> float:
+    """How many entries nested lists have in all; each list is looked at once, wherever it stands.
+
+    A list that holds itself has infinitely many.
+    """
+    known: dict[int, float] = {}
+    left = [value]
+    while left:
+        item = left[-1]
+        inner = [x for x in item if _is_list(x)] if _is_list(item) else []
+        fresh = [x for x in inner if id(x) not in known]
+        if id(item) not in known and fresh:
+            known[id(item)] = math.inf  # until what it holds is known
+            left += fresh
+            continue
+        left.pop()
+        own = float(len(item)) if _is_list(item) else 0.0
+        known[id(item)] = own + sum(known[id(x)] for x in inner)
+    return known[id(value)]
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, (list, tuple))
 
 
 def dense_array(value: Any, max_bytes: int | None = None) -> np.ndarray:
