@@ -1,8 +1,8 @@
 """This tree against an earlier commit, turn about: `python -m benchmarks.against COMMIT`.
 
 Each tree is imported by a process of its own, and both are asked for the same call one after the
-other, so that a machine that slows down slows both. That the results are the same is checked on
-every call.
+other, so that a machine that slows down slows both. How far the results differ is printed, too: at
+19dbbc9 a place in three solids counted less than now.
 """
 
 import json
@@ -22,8 +22,6 @@ from benchmarks.common import Table, progress, provenance, record_section
 
 _ROOT = Path(__file__).resolve().parents[1]
 _WORKER = Path(__file__).with_name("against_worker.py")
-# Of the volume, and of the gradient's largest entry.
-_SAME = 1e-5
 CALLS = {
     "default": "default",
     "rays512": "512 x 512 rays, one direction",
@@ -98,23 +96,41 @@ def main(settings: Settings) -> None:
         with progress() as bar:
             task = bar.add_task("calls", total=len(CALLS) * (settings.repeats + 1))
             for call, name in CALLS.items():
-                times = []
+                times, off = [], 0.0
                 for turn in range(settings.repeats + 1):
                     (old, was), (new, found) = before.measure(call), now.measure(call)
-                    if not np.allclose(found, was, rtol=_SAME, atol=_SAME * np.abs(was).max()):
-                        sys.exit(f"{name} must give the same results: got {found}, before {was}.")
+                    # The value's sum, and the spread of what else there is, such as the gradient.
+                    for k in (0, -1):
+                        off = max(off, abs(found[k] - was[k]) / max(abs(was[k]), 1e-30))
                     if turn:
                         times.append((old, new))
                     bar.advance(task)
                 old, new = np.array(times).T
                 ratio = np.percentile(new / old, [10, 50, 90])
                 figures = (np.median(old), np.median(new), old.min(), new.min())
-                rows.append((name, *(f"{x:.1f}" for x in figures), *(f"{x:.2f}" for x in ratio)))
+                rows.append(
+                    (
+                        name,
+                        *(f"{x:.1f}" for x in figures),
+                        *(f"{x:.2f}" for x in ratio),
+                        f"{100 * off:.1g}",
+                    )
+                )
         before.close()
         now.close()
     table = Table(
         f"Value and gradient under jit, this tree and {settings.commit}, milliseconds",
-        ("call", "median then", "now", "least then", "now", "ratio 10 %", "median", "90 %"),
+        (
+            "call",
+            "median then",
+            "now",
+            "least then",
+            "now",
+            "ratio 10 %",
+            "median",
+            "90 %",
+            "off, %",
+        ),
         rows,
     )
     table.print()
