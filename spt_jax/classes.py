@@ -162,6 +162,6 @@ _on_device = BoundedJit(_labels_of)
 def _labels_on_host(vertices, faces, options: _Options):
     try:
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        return (found.labels(options.rule),)
     except Unmeasurable:
         return (np.zeros(len(vertices), np.int8),)
-    return (found.labels(options.rule),)

@@ -294,15 +294,15 @@ def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
     nothing = np.zeros_like(vertices)
     try:
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        if faces.size == 0:
+            return np.zeros(()), nothing
+        if options.value == "volume":
+            value = np.array(found.volume)
+        else:
+            value = np.mean(found.labels(options.rule) != 0)
+        gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
     except Unmeasurable:
         return np.array(np.nan), nothing
-    if faces.size == 0:
-        return np.zeros(()), nothing
-    if options.value == "volume":
-        value = np.array(found.volume)
-    else:
-        value = np.mean(found.labels(options.rule) != 0)
-    gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
     # Measured in float64: it may be more than the vertices' dtype can hold, or less.
     narrow = options.rounding > np.finfo(np.float64).eps
     held = np.finfo(np.float32 if narrow else np.float64)

@@ -142,3 +142,17 @@ def test_many_spheres_in_one_place_end_with_a_result(suffix, tmp_path, capsys):
         assert ("it self-intersects" in seen.out) == (code == 1)
         assert main(["untangle", str(file), "--out", str(tmp_path / "out")]) == code
         assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("options", [{}, {"value": "ratio"}, {"gradient": "vertex"}])
+def test_rays_list_no_pairs_where_none_are_asked_for(options, monkeypatch):
+    """What is too crumpled to be listed has a volume by rays, and NaN where a label needs a list."""
+    monkeypatch.setattr(pairs, "_MOST_PAIRS", 0)
+    monkeypatch.setattr(pairs, "_MOST_PAIRS_EACH", 0)
+    vertices, faces = join(box(), box(center=(0.5, 0.2, 0.3)))
+    step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=32, **options))
+    value, gradient = step(jnp.asarray(vertices, "float32"))
+    if options:
+        assert np.isnan(value) and not np.asarray(gradient).any()
+    else:
+        assert value == pytest.approx(0.5 * 0.8 * 0.7, rel=0.1) and np.asarray(gradient).any()

@@ -81,14 +81,27 @@ class Measurement:
         vertices, faces: the mesh.
         sampling: how it is measured.
         exclusions: what does not count.
-        surface: what intersects, found from the triangles whether rays are cast or not.
+        rounding: machine epsilon of the numbers that the vertices came in.
     """
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     sampling: Sampling
     exclusions: Exclusions
-    surface: ExactSurface
+    rounding: float
+
+    @cached_property
+    def surface(self) -> ExactSurface:
+        """What intersects, found from the triangles.
+
+        Raises:
+            Unmeasurable: too much does to be listed.
+        """
+        try:
+            merged = not self.exclusions.any
+            return ExactSurface(self.vertices, self.faces, self.rounding, merged=merged)
+        except Entangled as tangle:
+            raise Unmeasurable(str(tangle)) from None
 
     @cached_property
     def overlap(self) -> ExactOverlap:
@@ -221,11 +234,10 @@ def measure(
     reason = _unusable(vertices, faces, rounding)
     if reason is not None:
         raise Unmeasurable(reason)
-    try:
-        surface = ExactSurface(vertices, faces, rounding, merged=not exclusions.any)
-    except Entangled as tangle:
-        raise Unmeasurable(str(tangle)) from None
-    return Measurement(vertices, faces, sampling, exclusions, surface)
+    found = Measurement(vertices, faces, sampling, exclusions, rounding)
+    if sampling.rays == "auto" or exclusions.any:
+        _ = found.surface  # rays alone need none
+    return found
 
 
 def _unusable(vertices, faces, rounding: float) -> str | None:
