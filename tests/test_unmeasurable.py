@@ -146,7 +146,7 @@ def test_many_spheres_in_one_place_end_with_a_result(suffix, tmp_path, capsys):
 
 @pytest.mark.parametrize("options", [{}, {"value": "ratio"}, {"gradient": "vertex"}])
 def test_rays_list_no_pairs_where_none_are_asked_for(options, monkeypatch):
-    """What is too crumpled to be listed has a volume by rays, and NaN where a label needs a list."""
+    """What is too crumpled to be listed has a volume by rays, and NaN where labels need a list."""
     monkeypatch.setattr(pairs, "_MOST_PAIRS", 0)
     monkeypatch.setattr(pairs, "_MOST_PAIRS_EACH", 0)
     vertices, faces = join(box(), box(center=(0.5, 0.2, 0.3)))
