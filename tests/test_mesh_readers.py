@@ -464,3 +464,11 @@ def test_lists_of_differing_lengths_between_other_properties(tmp_path, order):
     file.write_bytes(header.encode() + body[:-4])
     with pytest.raises(ValueError, match="ends at face 11 of 12; it is cut"):
         read_mesh(file)
+
+
+def test_a_glb_under_the_name_of_a_gltf_is_refused_by_that_name(tmp_path):
+    """trimesh looks for another file then, and names that one alone; the fuzz found it."""
+    path = tmp_path / "thing.gltf"
+    path.write_bytes(trimesh.creation.box().export(file_type="glb"))
+    with pytest.raises(ValueError, match=r"thing\.gltf.*it is a \.glb under another name"):
+        read_mesh(path)

@@ -35,6 +35,8 @@ def gltf_tree(content: bytes, path: Path) -> dict[str, Any]:
     text = content
     if content[:4] == b"glTF":
         version, length, chunk = (int.from_bytes(content[k : k + 4], "little") for k in (4, 8, 12))
+        if path.suffix.lower() == ".gltf":
+            raise UnreadableError("it is a .glb under another name; rename it")
         if version != 2:
             raise UnreadableError(f"it is glTF {version}; export glTF 2")
         if length > len(content) or 20 + chunk > len(content) or content[16:20] != b"JSON":

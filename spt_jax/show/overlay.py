@@ -125,7 +125,7 @@ def read_image(
     # Pillow hands .eps over to Ghostscript, which runs what they say.
     formats = [name for name in Image.OPEN if name != "EPS"]
     with file_errors("image", file), warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        warnings.simplefilter("ignore")  # of metadata, and of a size that is checked below
         try:
             with Image.open(file, formats=formats) as image:
                 width, height = image.size
