@@ -17,6 +17,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -94,15 +95,8 @@ class Workers:
             if work is None:
                 return function(*mesh, options)
             for worker in self._ready(work, 1):
-                try:
-                    found = self._elsewhere(worker, work, mesh)
-                except LostError:
-                    self._drop(worker)
-                except LateError:
-                    self._release(worker)
-                else:
-                    self._release(worker)
-                    return found
+                with self._lent(worker):
+                    return self._elsewhere(worker, work, mesh)
             return self._here(function, options, mesh, work)
         finally:
             with self._lock:
@@ -132,17 +126,11 @@ class Workers:
                 yield i
 
         def share(worker: Worker, work: bytes) -> None:
-            try:
+            with self._lent(worker):
                 for i in taken():
                     lost.append(i)
                     found[i] = self._elsewhere(worker, work, meshes[i])
                     lost.remove(i)
-            except LostError:
-                self._drop(worker)
-            except LateError:
-                self._release(worker)
-            else:
-                self._release(worker)
 
         begin = time.perf_counter()
         size = sum(len(faces) for _, faces in meshes)
@@ -184,6 +172,18 @@ class Workers:
         for worker in self._free:
             worker.leave_to_parent()
         self.__init__()
+
+    @contextmanager
+    def _lent(self, worker: Worker) -> Iterator[None]:
+        """A worker, which is given back unless it is lost; what it did not do is done here."""
+        try:
+            yield
+        except LostError:
+            self._drop(worker)
+        except LateError:
+            self._release(worker)
+        else:
+            self._release(worker)
 
     def _elsewhere(self, worker: Worker, work: bytes, mesh: Mesh) -> tuple[np.ndarray, ...]:
         size, begin = len(mesh[1]), time.perf_counter()

@@ -25,7 +25,6 @@ class Topology:
     Attributes:
         faces: the faces.
         ends: vertices of each edge, the lower first.
-        end_key: the same as single numbers, lower * V + higher, which ascend.
         edge_faces: the two triangles of each edge, or -1. An edge of more than two triangles has
             a row here and in `ends` for every two of them.
         halves: the half-edges of each row, or -1; 3 face + k is opposite to corner k.
@@ -45,7 +44,6 @@ class Topology:
 
     faces: Int[np.ndarray, "F 3"]
     ends: Int[np.ndarray, "R 2"]
-    end_key: Int[np.ndarray, "R"]
     edge_faces: Int[np.ndarray, "R 2"]
     halves: Int[np.ndarray, "R 2"]
     row: Int[np.ndarray, "F3"]
@@ -139,7 +137,6 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     return Topology(
         faces=faces,
         ends=ends,
-        end_key=ends @ np.array([count, 1]),
         edge_faces=np.stack([first // 3, np.where(second >= 0, second // 3, -1)], axis=1),
         halves=np.stack([first, second], axis=1),
         row=row,

@@ -21,6 +21,7 @@ class Sharing:
     """Pairs of triangles that may be of interest: those that are not known to share a vertex.
 
     Attributes:
+        groups: how many groups of clusters there are.
         key: of the pairs of groups that have such clusters, first * groups + second, ascending;
             the first is the lower one, or both are the same.
         row: for each of these and last for all other pairs of groups, by the places of two clusters
@@ -29,7 +30,6 @@ class Sharing:
             not known to share a vertex. In the last row, for all other pairs, none is.
     """
 
-    size: int
     groups: int
     key: Int[np.ndarray, "G"]
     row: Int[np.ndarray, "G1 CC"]
@@ -84,4 +84,4 @@ def sharing(corners: Int[np.ndarray, "3 S"], filled: Bool[np.ndarray, "S"], size
     key, at = np.unique(of_groups, return_inverse=True)
     row = np.full((len(key) + 1, size * size), len(found), np.int32)
     row[at, first % size * size + second % size] = np.arange(len(found))
-    return Sharing(size, groups, key, row, apart)
+    return Sharing(groups, key, row, apart)
