@@ -223,3 +223,23 @@ def test_photographs_that_are_none(tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"0" * 50)
     with pytest.raises(ValueError, match=r"must be a photograph that opens: got .*a\.png"):
         read_image(tmp_path / "a.png")
+
+
+def test_what_pillow_warns_of_metadata_is_not_handed_on(tmp_path):
+    """A tag with a value too many, as a flipped bit leaves it; the suite takes warnings for errors.
+
+    The fuzz found it: Pillow reads the pixels all the same.
+    """
+    path = tmp_path / "a.tif"
+    pixels = np.arange(20 * 30 * 3, dtype=np.uint8).reshape(20, 30, 3)
+    Image.fromarray(pixels).save(path)
+    content = bytearray(path.read_bytes())
+    # RowsPerStrip: the tag 278, of any type, with one value.
+    at = next(
+        k for k in range(8, len(content)) if content[k : k + 2] == (278).to_bytes(2, "little")
+    )
+    content[at + 4] = 9
+    path.write_bytes(content)
+    with pytest.warns(UserWarning, match="tag 278"), Image.open(path) as image:
+        image.load()
+    assert read_image(path).shape == (20, 30, 3)
