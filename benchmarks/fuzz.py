@@ -2,11 +2,14 @@
 
 Every case is rebuilt by the seed and its number, which a failure prints: `--only meshes:12345`.
 Cases run in processes of their own with a limit on memory, so that a crash or a hang is counted,
-and the run goes on. It ends with 1 where anything failed.
+and the run goes on. It ends with 1 where anything failed. With `--log` every case is written down
+as it is done, and a run that was ended goes on where it was: the same command again.
 """
 
 import collections
 import importlib
+import itertools
+import json
 import multiprocessing
 import os
 import resource
@@ -14,8 +17,10 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import tyro
@@ -45,6 +50,8 @@ class Settings:
     seed: int = 0
     only: str = ""
     """One case, such as meshes:12345; the process that is asked runs it by itself."""
+    log: Path | None = None
+    """A file of one line for each case; those that are in it already are not tried again."""
     processes: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     record: bool = False
     """Write the tables into results.md."""
@@ -58,6 +65,7 @@ class Case(NamedTuple):
     row: str
     column: str
     faults: list[str]
+    seconds: float = 0.0
 
 
 def main(settings: Settings) -> int:
@@ -69,20 +77,20 @@ def main(settings: Settings) -> int:
         cases = [_tried(topic, settings.seed, int(number))]
         print(f"{settings.only}: {cases[0].row}, {cases[0].column}")
         return _told(cases, settings.seed)
-    start = time.monotonic()
     seconds = settings.seconds + 3600 * settings.hours
-    cases, failed = [], 0
+    known, cases, failed = _logged(settings), [], 0
     for topic in _TOPICS:
         count = None if seconds else getattr(settings, topic)
         room = seconds * _SHARE[topic] if seconds else float("inf")
-        found = _run(topic, settings, count, room)
+        found = [case for case in known if case.topic == topic and _is_asked(case, count)]
+        found += _run(topic, settings, count, room, {case.number for case in found})
         failed |= _told(found, settings.seed)
         cases += found
     tables = _tables(cases)
     for table in tables:
         table.print()
-    took = time.monotonic() - start
-    print(f"{len(cases):,} cases in {took:.0f} s, {sum(bool(c.faults) for c in cases)} failed.")
+    took, faulty = sum(case.seconds for case in cases), sum(bool(case.faults) for case in cases)
+    print(f"{len(cases):,} cases, {took:.0f} s by themselves, {faulty} failed.")
     if settings.record:
         _record(settings, cases, tables, took)
     return failed
@@ -91,12 +99,14 @@ def main(settings: Settings) -> int:
 def _tried(topic: Topic, seed: int, number: int) -> Case:
     """One case; whatever is raised that should not be is its fault."""
     check = importlib.import_module(f"benchmarks.fuzz_{topic}").check
+    start = time.monotonic()
     try:
-        return Case(topic, number, *check(seed, number))
+        found = check(seed, number)
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         told = f"{type(error).__name__}: {error} ({where.name}, line {where.lineno})"
-        return Case(topic, number, "any", "raised", [told])
+        found = "any", "raised", [told]
+    return Case(topic, number, *found, round(time.monotonic() - start, 4))
 
 
 def _serve(topic: Topic, seed: int, pipe: Any) -> None:
@@ -114,28 +124,31 @@ def _serve(topic: Topic, seed: int, pipe: Any) -> None:
             pipe.send(_tried(topic, seed, number))
 
 
-def _run(topic: Topic, settings: Settings, count: int | None, seconds: float) -> list[Case]:
-    """Cases from number 0 on, until there are as many or the time is up, by several processes."""
-    if count == 0:
-        return []
+def _run(
+    topic: Topic, settings: Settings, count: int | None, seconds: float, known: set[int]
+) -> list[Case]:
+    """Cases from number 0 on but for those `known`, until there are as many or the time is up."""
+    numbers = (k for k in range(sys.maxsize if count is None else count) if k not in known)
+    batches = iter(lambda: tuple(itertools.islice(numbers, _BATCH[topic])), ())
     cases: list[Case] = []
-    lock, batches = threading.Lock(), iter(range(0, count or sys.maxsize, _BATCH[topic]))
-    end = time.monotonic() + seconds
+    lock, end = threading.Lock(), time.monotonic() + seconds
 
     def drive() -> None:
         process = pipe = None
         while time.monotonic() < end:
             with lock:
-                first = next(batches, None)
-            if first is None:
+                batch = next(batches, None)
+            if batch is None:
                 break
-            last = first + _BATCH[topic] if count is None else min(first + _BATCH[topic], count)
-            while first < last:
+            while batch:
                 if process is None:
                     process, pipe = _started(topic, settings.seed)
-                case = _answers(process, pipe, topic, range(first, last), cases)
-                first = case if case is not None else last
-                if case is not None:
+                found = _answers(process, pipe, topic, batch)
+                with lock:
+                    cases.extend(found)
+                    _log(settings, found)
+                batch = batch[len(found) :]
+                if not process.is_alive():
                     process = None
         if process is not None and pipe is not None:
             pipe.send(None)
@@ -144,9 +157,32 @@ def _run(topic: Topic, settings: Settings, count: int | None, seconds: float) ->
     with ThreadPoolExecutor(settings.processes) as drivers:
         for driver in [drivers.submit(drive) for _ in range(settings.processes)]:
             driver.result()
-    if not cases or (count is not None and len(cases) < count):
-        raise RuntimeError(f"{count or 'some'} {topic} must be tried: got {len(cases)}.")
+    done = len(cases) + len(known)
+    if done < (1 if count is None else count):
+        raise RuntimeError(f"{count or 'some'} {topic} must be tried: got {done}.")
     return cases
+
+
+def _is_asked(case: Case, count: int | None) -> bool:
+    return count is None or case.number < count
+
+
+def _log(settings: Settings, cases: Iterable[Case]) -> None:
+    if settings.log is not None:
+        with settings.log.open("a") as file:
+            file.writelines(json.dumps([settings.seed, *case]) + "\n" for case in cases)
+
+
+def _logged(settings: Settings) -> list[Case]:
+    """The cases of this seed in the log; a last line that was being written does not count."""
+    if settings.log is None or not settings.log.exists():
+        return []
+    text = settings.log.read_text()
+    whole, cut = text[: text.rfind("\n") + 1], text[text.rfind("\n") + 1 :]
+    if cut:
+        settings.log.write_text(whole)
+    lines = (json.loads(line) for line in whole.splitlines())
+    return [Case(*fields) for seed, *fields in lines if seed == settings.seed]
 
 
 def _started(topic: Topic, seed: int) -> tuple[Any, Any]:
@@ -165,9 +201,10 @@ def _started(topic: Topic, seed: int) -> tuple[Any, Any]:
     return process, ours
 
 
-def _answers(process, pipe, topic: Topic, numbers: range, cases: list[Case]) -> int | None:
-    """Cases as they are answered; the number to go on with where the process crashed or hung."""
+def _answers(process, pipe, topic: Topic, numbers: Sequence[int]) -> list[Case]:
+    """Cases as they are answered; the last one is that which crashed or hung the process."""
     pipe.send(list(numbers))
+    cases = []
     for number in numbers:
         try:
             if pipe.poll(_PATIENCE):
@@ -175,14 +212,14 @@ def _answers(process, pipe, topic: Topic, numbers: range, cases: list[Case]) -> 
                 continue
             what = f"no answer in {_PATIENCE:g} s"
             process.kill()
-            process.join()
         except (EOFError, ConnectionError):
-            process.join()
-            what = f"the process ended with {process.exitcode}"
+            what = "the process ended with {}"
+        process.join()
         pipe.close()
-        cases.append(Case(topic, number, "any", "crash or hang", [what]))
-        return number + 1
-    return None
+        fault = what.format(process.exitcode)
+        cases.append(Case(topic, number, "any", "crash or hang", [fault]))
+        break
+    return cases
 
 
 def _told(cases: list[Case], seed: int) -> int:
@@ -224,7 +261,7 @@ memory than 300 MB."""
 def _record(settings: Settings, cases: list[Case], tables: list[Table], took: float) -> None:
     given = [f"--{topic} {sum(case.topic == topic for case in cases)}" for topic in _TOPICS]
     command = f"python -m benchmarks.fuzz {' '.join(given)} --seed {settings.seed} --record"
-    parts = [provenance(command), f"{_ABOUT} It took {took / 60:.0f} minutes."]
+    parts = [provenance(command), f"{_ABOUT} The cases took {took / 60:.0f} minutes."]
     record_section("fuzz", "Fuzz", "\n\n".join([*parts, *(t.markdown() for t in tables)]))
 
 

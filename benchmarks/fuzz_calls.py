@@ -159,6 +159,9 @@ def _options(rng: np.random.Generator, traced_faces: bool) -> dict[str, Any]:
         options["ignore_groups"] = (((0, 0), (1, 1)), ((0, 1),))[rng.integers(2)]
     if not traced_faces and rng.integers(3) == 0:
         options["folds"] = RestSurface(_REST, _FACES, distance=0.3)
+    if rng.integers(4) == 0:  # by fewer rays than it casts by default, which only cost time here
+        options |= {"backend": "xla", "rays": options.get("rays", "auto")}
+        options["rays"] = 24 if options["rays"] == "auto" else options["rays"]
     return options
 
 

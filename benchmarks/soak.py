@@ -38,7 +38,8 @@ from spt_jax import (
     untangle_pose,
 )
 
-# Of memory, from the end of the first sixth on: medians of a tenth of the time that is left.
+# Of memory, from the end of the first sixth on (of an hour, ten minutes): the median of each tenth
+# of the time that is left, against the first of them.
 _GROWTH = 1.05
 _WARMING = 1 / 6
 # Seconds without a single step, compiling included, after which a thread stands still.
@@ -290,11 +291,12 @@ def _stands_still(job: Job) -> bool:
 
 
 def growth_of(samples: list[Sample]) -> float:
-    """Resident memory in the last tenth of the time over that after the first sixth."""
-    resident = np.array([one.resident + one.children for one in samples], float)
-    kept = resident[int(_WARMING * len(resident)) :]
-    part = max(1, len(kept) // 10)
-    return float(np.median(kept[-part:]) / np.median(kept[:part]))
+    """The most resident memory of any tenth of the time over that just after the first sixth."""
+    end = samples[-1].seconds
+    kept = [one for one in samples if one.seconds >= _WARMING * end]
+    resident = np.array([one.resident + one.children for one in kept], float)
+    tenths = [np.median(part) for part in np.array_split(resident, min(10, len(resident)))]
+    return float(max(tenths) / tenths[0])
 
 
 def main(settings: Settings) -> int:
