@@ -212,9 +212,10 @@ def test_bodies_stand_in_front_of_the_camera_at_a_plausible_distance(fits):
     assert failing(rows, depth.min(axis=1) < 0.1) == []
     distance = depth.mean(axis=1)
     assert failing(rows, (distance < 0.5) | (distance > 50)) == []
-    # Seventeen points in one place are somebody very far away, if anybody.
+    # Seventeen points in one place are somebody very far away, if anybody: the farther the better,
+    # so that where the solver stops depends on its rounding.
     gone = np.asarray(fits.joints)[rows_of("place"), :22, 2]
-    assert (gone > 10).all() and (gone < 500).all()
+    assert (gone > 10).all()
 
 
 def test_joints_stay_in_their_ranges(body, fits):
