@@ -3,13 +3,17 @@
 import io
 import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from helpers import box
+from helpers_body import ball_arrays
 
 from spt_jax.cli import main
+from spt_jax.commands.terminal import CommandError
+from spt_jax.view.files import open_file, open_upload
 
 SUFFIXES = ["ply", "obj", "off", "stl", "glb", "gltf", "3mf", "dae", "step", "drc", "xyz", "npz"]
 
@@ -128,6 +132,50 @@ def test_limits_are_told_and_can_be_raised(clean, tmp_path, capsys):
     words = ["untangle", str(tmp_path / "a.npz"), "--out", str(tmp_path / "out")]
     assert main([*words, "--max-bytes", "100000"]) == 2
     assert "must not take more than 100,000 bytes: got 4,752,000" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", ["keypoints", "camera", "image", "body"])
+def test_every_file_of_a_fit_is_held_to_the_limit_and_lets_it_be_raised(
+    given, tmp_path, capsys, monkeypatch, rng
+):
+    np.savez(tmp_path / "small.npz", keypoints=100 * rng.random((1, 17, 2)), layout="coco17")
+    np.savez(tmp_path / "camera.npz", matrix=np.ones((3, 4)), focal=np.ones(999))
+    np.savez(tmp_path / "body.npz", **ball_arrays())
+    np.savez(tmp_path / "keypoints.npz", keypoints=np.ones((9, 17, 3)), layout="coco17")
+    PIL = pytest.importorskip("PIL.Image")
+    PIL.new("RGB", (60, 60)).save(tmp_path / "image.png")
+    file = next(tmp_path.glob(f"{given}.*"))
+    words = ["fit", str(tmp_path / "small.npz"), "--out", str(tmp_path / "out"), "--quiet"]
+    words += [f"--{given}", str(file)]
+    words = ["fit", str(file), *words[2:5]] if given == "keypoints" else words
+    assert main([*words, "--max-bytes", "2000"]) == 2
+    seen = capsys.readouterr().err
+    assert file.name in seen and "must not take more than 2,000 bytes" in seen
+    assert "raise max_bytes (--max-bytes)" in seen and seen.count("\n") == 1
+    monkeypatch.setattr("spt_jax.commands.fitting.fit_everyone", _stop)
+    main([*words, "--max-bytes", "1000000"])
+    assert "must not take" not in capsys.readouterr().err
+
+
+def _stop(*_, **__):
+    raise CommandError("far enough")
+
+
+def test_a_view_s_files_are_held_to_the_limit_and_let_it_be_raised(clean, tmp_path, capsys):
+    pytest.importorskip("viser")
+    assert main(["view", clean, "--quiet", "--max-bytes", "100"]) == 2
+    seen = capsys.readouterr().err
+    assert "raise max_bytes (--max-bytes)" in seen and seen.count("\n") == 1
+    np.savez(tmp_path / "body.npz", **ball_arrays())
+    np.savez_compressed(tmp_path / "poses.npz", poses=np.zeros((9000, 66)))
+    for file in (Path(clean), tmp_path / "body.npz", tmp_path / "poses.npz"):
+        for opened in (
+            lambda limit, file=file: open_file(file, max_bytes=limit),
+            lambda limit, file=file: open_upload(file.name, file.read_bytes(), max_bytes=limit),
+        ):
+            with pytest.raises(ValueError, match=f"{file.stem}.*--max-bytes"):
+                opened(100)
+            opened(10_000_000)
 
 
 def test_what_was_done_to_read_a_file_is_said(tmp_path, capsys):

@@ -52,8 +52,11 @@ def gather(
     camera: Path | None,
     focal: float | None,
     center: tuple[float, float] | None,
+    max_bytes: int | None = None,
 ) -> tuple[list[Annotated], list[str]]:
     """The people asked for, and what is to be noted about them.
+
+    `max_bytes` is what the camera's file, and the pixels of a photograph, may take.
 
     Raises:
         ValueError, TypeError, OSError: people that the file lacks, a camera or an image that is
@@ -64,7 +67,7 @@ def gather(
         raise ValueError(f"{path} must hold people with visible points: got {left or 'nobody'}.")
     if camera is not None and (focal is not None or center is not None):
         raise ValueError("camera must be given as a file, or by focal and center: got both.")
-    given = None if camera is None else read_camera(camera)
+    given = None if camera is None else read_camera(camera, max_bytes=max_bytes)
     images = _image_names([person.image for person in file.people], path)
     names = [f"{image_name}/{row}" for row, image_name in enumerate(images)]
     rows = select_people(names, images, people)
@@ -80,7 +83,7 @@ def gather(
             if image is not None and found is None:
                 notes.append(f"no photograph of {images[row]} in {image}; a blank canvas is drawn")
             same = [p for p, name in zip(file.people, images, strict=True) if name == images[row]]
-            width, height = sizes[images[row]] = _size(images[row], same, found)
+            width, height = sizes[images[row]] = _size(images[row], same, found, max_bytes)
             if found is not None and not 16 <= min(width, height) <= max(width, height) <= LARGEST:
                 notes.append(f"{found} is {width} by {height} pixels; a blank canvas is drawn")
                 found = None
@@ -103,11 +106,11 @@ def gather(
     return gathered, notes
 
 
-def read_camera(path: Path) -> "PinholeCamera":
+def read_camera(path: Path, *, max_bytes: int | None = None) -> "PinholeCamera":
     """The camera of a .json or .npz file: `matrix` (3, 4), or `focal` and `center`.
 
     `rotation` (3, 3) and `translation` (3,), from the world to the camera, may stand beside `focal`
-    and `center`; a .json file may hold the matrix alone.
+    and `center`; a .json file may hold the matrix alone. `max_bytes` is what the file may take.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -117,9 +120,9 @@ def read_camera(path: Path) -> "PinholeCamera":
 
     what = "camera file"
     if path.suffix.lower() == ".npz":
-        content: Any = read_npz(path, what=what).arrays
+        content: Any = read_npz(path, what=what, max_bytes=max_bytes).arrays
     else:
-        content = read_json(path, what)
+        content = read_json(path, what, max_bytes=max_bytes)
     content = {"matrix": content} if isinstance(content, list) else content
     if not isinstance(content, dict) or not (
         "matrix" in content or {"focal", "center"} <= set(content)
@@ -198,11 +201,13 @@ def _photograph(given: Path | None, image: str | int | None, count: int) -> Path
     return next((given / name for name in names if (given / name).is_file()), None)
 
 
-def _size(image: str, people: Sequence["Person"], photograph: Path | None) -> tuple[int, int]:
+def _size(
+    image: str, people: Sequence["Person"], photograph: Path | None, max_bytes: int | None
+) -> tuple[int, int]:
     """Of the file, else of the photograph, else of an image with the points in its middle."""
     stated = {(p.width, p.height) for p in people if p.width and p.height}
     told = stated.pop() if stated else None
-    seen = None if photograph is None else _photograph_size(photograph)
+    seen = None if photograph is None else _photograph_size(photograph, max_bytes)
     if seen is not None:
         width, height = seen
         if told is not None and told != (width, height):
@@ -220,11 +225,11 @@ def _size(image: str, people: Sequence["Person"], photograph: Path | None) -> tu
     return int(width), int(height)
 
 
-def _photograph_size(path: Path) -> tuple[int, int] | None:
+def _photograph_size(path: Path, max_bytes: int | None) -> tuple[int, int] | None:
     from spt_jax.show.overlay import read_image
 
     try:
-        height, width, _ = read_image(path).shape
+        height, width, _ = read_image(path, max_bytes=max_bytes).shape
     except ImportError:  # without Pillow no picture is drawn; that says why
         return None
     return width, height

@@ -73,8 +73,8 @@ def fit(
         together: fit the people of an image as one scene, so that they do not pass through each
             other either.
         anew: throw away what is done of an unfinished run in the folder.
-        max_bytes: how large the keypoint file may be, and its arrays once unpacked; not given: 256
-            MiB of JSON, 1 GiB of arrays.
+        max_bytes: what each file that is read, its arrays and a photograph's pixels may take; not
+            given: 256 MiB of JSON, 1 GiB of anything else.
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
@@ -98,6 +98,7 @@ def fit(
             camera=camera,
             focal=focal,
             center=center,
+            max_bytes=max_bytes,
         )
     start = time.perf_counter()
     with progress_bar(len(chosen), quiet) as state:
@@ -117,7 +118,7 @@ def fit(
 
         with user_errors():
             groups = scenes_of(chosen) if together else [[one] for one in chosen]
-            model = load_body(body)
+            model = load_body(body, max_bytes=max_bytes)
             for layout in {one.person.layout for one in chosen}:
                 keypoint_regressor(model, layout)
             folder = ensure_folder(out)

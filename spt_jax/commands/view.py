@@ -13,6 +13,7 @@ def view(
     port: int = 8080,
     host: str = "127.0.0.1",
     upload_limit: int = 256,
+    max_bytes: int | None = None,
     quiet: bool = False,
 ) -> int:
     """Look at a body or a mesh in the browser, bend it, and watch it come free.
@@ -27,6 +28,8 @@ def view(
         host: the address to serve on. Other machines reach a view on 0.0.0.0, without encryption;
             whoever has the address that is printed, with its token, can use it.
         upload_limit: what a file that the browser sends may have, in megabytes.
+        max_bytes: what a file and its arrays may take once unpacked, uploads included; not given:
+            1 GiB.
         quiet: print the address and errors alone.
     """
     if not 0 < port < 65536:
@@ -38,7 +41,9 @@ def view(
 
     try:
         with user_errors():
-            served = View(file, host=host, port=port, upload_limit=upload_limit)
+            served = View(
+                file, host=host, port=port, upload_limit=upload_limit, max_bytes=max_bytes
+            )
     except ImportError as error:
         raise CommandError(" ".join(str(error).split())) from error
     served.start()

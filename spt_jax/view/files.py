@@ -37,30 +37,34 @@ class Frames:
         scene.load(self.pose[row], shape, translation)
 
 
-def open_file(path: Path, name: str | None = None) -> Scene | PoseFile:
+def open_file(
+    path: Path, name: str | None = None, *, max_bytes: int | None = None
+) -> Scene | PoseFile:
     """What a file holds: a mesh or a body as a scene, or poses.
 
     Args:
         path: .pkl is an SMPL model; .npz one too if it has `v_template`, otherwise poses; anything
             else is a mesh, which must be closed.
         name: what a scene is called; the file's name without its suffix if None.
+        max_bytes: what the file and its arrays may take once unpacked; 1 GiB where None.
 
     Raises:
         FileNotFoundError, OSError: there is no such file, or the system does not let it be read.
+        TooLargeError: it takes more than the limit.
         ValueError: no regular file, one that cannot be read, or a mesh that is not closed and
             consistently wound.
     """
     path = as_file(path)  # a pipe would be waited for
     if path.suffix == ".pkl" or _is_model(path):
-        return Scene.of_body(load_body(path), name or path.stem)
+        return Scene.of_body(load_body(path, max_bytes=max_bytes), name or path.stem)
     if path.suffix.lower() == ".npz":
-        return read_poses(path)
-    vertices, faces = read_mesh(path)
+        return read_poses(path, max_bytes=max_bytes)
+    vertices, faces = read_mesh(path, max_bytes=max_bytes)
     check_mesh(vertices, faces).raise_if_unfit()
     return Scene.of_mesh(vertices, faces, name or path.stem)
 
 
-def open_upload(name: str, content: bytes) -> Scene | PoseFile:
+def open_upload(name: str, content: bytes, *, max_bytes: int | None = None) -> Scene | PoseFile:
     """The same for a file that a browser sent; nothing of it stays on the disk.
 
     On the disk it has a name of our own: of the one that it came with, the suffix says which reader
@@ -76,7 +80,7 @@ def open_upload(name: str, content: bytes) -> Scene | PoseFile:
         path = Path(folder) / (own + (suffix if _SUFFIX.fullmatch(suffix) else ""))
         path.write_bytes(content)
         try:
-            opened = open_file(path, title)
+            opened = open_file(path, title, max_bytes=max_bytes)
         except (OSError, TypeError, ValueError) as error:
             message = str(error).replace(str(path), label).replace(path.name, label)
             raise ValueError(message.replace(own, title)) from error

@@ -49,6 +49,7 @@ class View:
         host: address to serve on; who can reach it still needs the token of `url`.
         port: the next free one is taken where it is in use.
         upload_limit: of a file that a browser sends, in megabytes.
+        max_bytes: what a file and its arrays may take once unpacked; 1 GiB where None.
         patience: seconds that a browser has for an answer; one that gives none is let go.
 
     Raises:
@@ -64,11 +65,13 @@ class View:
         host: str = "127.0.0.1",
         port: int = 8080,
         upload_limit: int = UPLOAD_LIMIT,
+        max_bytes: int | None = None,
         patience: float = PATIENCE,
     ):
         viser = import_viser()
         self.access, numeric = access_for(host)
-        opened = None if file is None else files.open_file(file)
+        opened = None if file is None else files.open_file(file, max_bytes=max_bytes)
+        self._max_bytes = max_bytes
         port = free_port(numeric, port)
         self.server = start_guarded(viser, self.access, numeric, port, patience)
         self._stop = threading.Event()
@@ -188,7 +191,8 @@ class View:
 
     def open_upload(self, name: str, content: bytes) -> None:
         """Show a file that a browser sent; a bad one changes nothing."""
-        self._take(files.open_upload(name, content), files.label_of(name), first=False)
+        opened = files.open_upload(name, content, max_bytes=self._max_bytes)
+        self._take(opened, files.label_of(name), first=False)
 
     def open_embedded(self) -> None:
         """Show the body that comes with the package."""
