@@ -176,10 +176,7 @@ and limits: its error against RE was then +0.21 mm (-0.97 to +2.03) with exact j
 
 def main(settings: Settings) -> None:
     """Print the tables, and record them."""
-    if settings.tune:
-        found = tuning(settings)
-    else:
-        found = tables(settings)
+    found = tuning(settings) if settings.tune else tables(settings)
     if settings.record:
         count = len(settings.conditions)
         for k, objective in enumerate(settings.objectives):

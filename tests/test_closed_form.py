@@ -303,7 +303,9 @@ def test_copies_in_one_place(count, turned):
     assert growth == pytest.approx(3 * found.volume, rel=1e-10)
 
 
-@pytest.mark.parametrize("upright, turned_over", [(1, 1), (2, 1), (3, 1), (1, 2), (0, 2), (2, 2)])
+@pytest.mark.parametrize(
+    ("upright", "turned_over"), [(1, 1), (2, 1), (3, 1), (1, 2), (0, 2), (2, 2)]
+)
 @pytest.mark.parametrize("other", [None, box((0.3, 2, 0.3), (0.1, 0, 0.2))])
 def test_copies_inside_out_take_one_away(upright, turned_over, other):
     """In a ball that is there a times, and b times inside out, w is a - b; a place is a kink."""

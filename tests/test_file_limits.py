@@ -172,12 +172,12 @@ def test_a_small_file_is_read_without_room_for_the_limit(tmp_path):
 
 
 def test_errors_get_their_file(tmp_path):
-    with pytest.raises(ValueError, match=r"mesh file must fit into memory: got 'a\.ply'"):
-        with file_errors("mesh file", "a.ply"):
-            raise MemoryError
-    with pytest.raises(OSError, match=r"mesh file must be readable: got 'a.ply' \(bad disk\)"):
-        with file_errors("mesh file", "a.ply"):
-            raise OSError(5, "bad disk")
+    full = pytest.raises(ValueError, match=r"mesh file must fit into memory: got 'a\.ply'")
+    with full, file_errors("mesh file", "a.ply"):
+        raise MemoryError
+    broken = pytest.raises(OSError, match=r"mesh file must be readable: got 'a.ply' \(bad disk\)")
+    with broken, file_errors("mesh file", "a.ply"):
+        raise OSError(5, "bad disk")
 
 
 def png(width, height, rows=b""):

@@ -114,7 +114,7 @@ def test_bodies_move_with_the_camera_and_the_size_of_the_image(people, plain):
 
 def test_order_of_people_a_list_and_what_was_not_seen(people, plain):
     _, _, keypoints = people
-    found = fit([row for row in keypoints[::-1]])
+    found = fit(list(keypoints[::-1]))
     assert found.pose.shape == (8, 52, 3)
     assert agreeing(jax.tree.map(lambda leaf: leaf[::-1], found), plain).sum() >= 7
     # A point without confidence may be anything.

@@ -184,9 +184,9 @@ def test_an_input_that_changed_is_named(tmp_path):
 
 def test_two_runs_do_not_share_a_folder(tmp_path):
     pytest.importorskip("fcntl")
-    with UnfinishedRun(tmp_path, {"a": 1}, say=print):
-        with pytest.raises(ValueError, match="must not be worked on by another run: got "):
-            UnfinishedRun(tmp_path, {"a": 1}, say=print)
+    refused = pytest.raises(ValueError, match="must not be worked on by another run: got ")
+    with UnfinishedRun(tmp_path, {"a": 1}, say=print), refused:
+        UnfinishedRun(tmp_path, {"a": 1}, say=print)
     assert not (tmp_path / "unfinished").exists()
 
 

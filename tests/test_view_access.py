@@ -207,7 +207,7 @@ def test_garbage_before_the_handshake_says_nothing_and_ends_nothing(
 
 
 @pytest.mark.parametrize(
-    "content, code",
+    ("content", "code"),
     [
         (b"nonsense", 1007),
         ("text", 1007),

@@ -64,7 +64,7 @@ def test_a_file_over_the_limit_is_refused_before_it_is_taken(view):
 
 
 @pytest.mark.parametrize(
-    "size, parts",
+    ("size", "parts"),
     [
         (20, [(0, b"x" * 10), (0, b"x" * 10)]),
         (20, [(1, b"x" * 10)]),
@@ -145,7 +145,7 @@ def test_no_name_becomes_a_path(name, ball, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name, label",
+    ("name", "label"),
     [
         ("", "file"),
         ("/", "file"),
@@ -161,7 +161,7 @@ def test_a_name_is_shown_in_one_printable_line(name, label):
 
 
 @pytest.mark.parametrize(
-    "name, suffix",
+    ("name", "suffix"),
     [("a.ply ", ".ply"), ("a.p/../ly", ""), ("a.a b", ""), ("a.\u0440ly", ""), ("a.PLY", ".ply")],
 )
 def test_only_a_plain_suffix_reaches_the_disk(name, suffix, monkeypatch):
@@ -172,7 +172,7 @@ def test_only_a_plain_suffix_reaches_the_disk(name, suffix, monkeypatch):
         raise ValueError(f"file must be read: got {str(path)!r}, {path.name!r}, {path.stem!r}")
 
     monkeypatch.setattr(files, "open_file", refuse)
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match="must be read") as caught:
         files.open_upload(name, b"x")
     assert seen[0].suffix == suffix and seen[0].stem not in str(caught.value)
 

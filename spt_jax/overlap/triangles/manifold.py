@@ -287,11 +287,9 @@ def _loops(faces, left) -> list[np.ndarray]:
 
 def _one_sheet_each(faces, pairs, count: int):
     """Corners by new vertices, one for each sheet at a vertex, and the old vertex of each."""
-    links = []
     (a, k), (b, m) = np.divmod(pairs[0], 3), np.divmod(pairs[1], 3)
-    for turn in (1, 2):
-        # The partner runs the other way.
-        links.append(np.stack([3 * a + (k + turn) % 3, 3 * b + (m + 3 - turn) % 3]))
+    # The partner runs the other way.
+    links = [np.stack([3 * a + (k + turn) % 3, 3 * b + (m + 3 - turn) % 3]) for turn in (1, 2)]
     first, second = np.concatenate(links, axis=1)
     graph = scipy.sparse.coo_array(
         (np.ones(len(first), np.int8), (first, second)), shape=(faces.size, faces.size)
