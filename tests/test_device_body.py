@@ -29,6 +29,7 @@ def test_poses_as_on_the_host():
         assert np.linalg.norm(gradient - expected) < 1e-5 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_folds_do_not_count():
     """Whether anything counts, which vertices, and which part of a region that folds here and
     collides there: that hangs on all of its rim, which few rays meet."""

@@ -19,6 +19,7 @@ from spt_jax.overlap.triangles.pair_layout import prepared
 from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 
 
+@pytest.mark.slow
 def test_groups_as_on_the_host():
     """What two of three boxes share does not count, nor does anything where they are only two.
 
@@ -81,6 +82,7 @@ def test_fingers_are_near_exactly(rng):
     assert not _near_at_rest(rest_table(body.rest_surface.copies(2)), *apart).any()
 
 
+@pytest.mark.slow
 def test_what_is_enclosed_at_rest_does_not_count():
     """Neither by rays nor exactly; what two bodies share does."""
     eyed = join(box(), box((0.2, 0.2, 0.2), (0.05, 0.02, 0.01)))

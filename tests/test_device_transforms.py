@@ -42,6 +42,7 @@ def check(values, gradients):
     np.testing.assert_allclose(gradients, expected()[1], rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_nested_vmap_over_meshes_and_faces_in_shard_map():
     """Several meshes at once, of which some take more strips than others, over one device."""
     settings = Xla(segments=200, crossings=600, meshes_at_once=4)

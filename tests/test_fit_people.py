@@ -60,6 +60,7 @@ def crossings_between(body, vertices):
     return found
 
 
+@pytest.mark.slow
 def test_people_who_embrace_end_apart(body, fitted):
     found, seen = fitted
     assert int(found.before.crossings_between) > 0

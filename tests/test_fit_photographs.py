@@ -16,6 +16,8 @@ from spt_jax import PinholeCamera, fit_pose, load_body, load_mocap, read_keypoin
 from spt_jax.fit.terms.priors import joint_limits
 from spt_jax.keypoints import LAYOUTS, keypoint_regressor
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 640, 480
 COCO = LAYOUTS["coco17"]
 NOISE = 5  # pixels

@@ -163,6 +163,7 @@ def traced(people):
     return call(jnp.asarray(people[2][:5]), jnp.asarray(trust), camera())
 
 
+@pytest.mark.slow
 def test_under_jit_and_vmap_as_outside(plain, traced):
     assert agreeing(traced, jax.tree.map(lambda leaf: leaf[:5], plain))[:4].all()
 
@@ -210,6 +211,7 @@ class Crouch(Regulariser):
         return 100 * jnp.sum((joints[:, head, 1] - joints[:, 0, 1]) ** 2)
 
 
+@pytest.mark.slow
 def test_ones_own_start_and_regulariser_in_double_precision(x64):
     """From a given pose, with shape, one keypoint wrong, the body's place known."""
     body = embedded_body()
@@ -258,6 +260,7 @@ def test_ones_own_start_and_regulariser_in_double_precision(x64):
     np.testing.assert_allclose(low.terms["crouch"][0], 30 * 100 * heads[0] ** 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "solver"),
     [
@@ -294,6 +297,7 @@ def test_each_regulariser_descends_with_another_solver(name, solver):
         assert first > 0.5 and after.energy < first
 
 
+@pytest.mark.slow
 def test_too_few_steps_are_said():
     found = fit_pose(
         embedded_body(),

@@ -114,6 +114,7 @@ def test_eq_10_is_zero_where_the_normals_cancel():
     np.testing.assert_array_equal(gradient, 0)
 
 
+@pytest.mark.slow
 def test_three_directions_are_close_to_2048_rays_along_pose_directions():
     """Twenty pose directions; those along which the overlap hardly changes are left out."""
     rng = np.random.default_rng(5)

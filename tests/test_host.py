@@ -24,6 +24,7 @@ def run(*arguments, timeout):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cores", [1, 2])
 def test_no_deadlock(cores):
     """https://github.com/jax-ml/jax/issues/24255, https://github.com/jax-ml/jax/issues/25861.

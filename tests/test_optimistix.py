@@ -43,8 +43,11 @@ LEAST_SQUARES = {
 }
 
 
-@pytest.mark.parametrize("options", [{}, {"jac": "bwd"}], ids=["default", "jac=bwd"])
-@pytest.mark.parametrize("name", MINIMISERS)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [*((name, {}) for name in MINIMISERS), ("BFGS", {"jac": "bwd"})],
+    ids=[*MINIMISERS, "BFGS with jac=bwd"],
+)
 def test_minimisers(name, options, dtype):
     start, weight = jnp.zeros(3, dtype), jnp.asarray(0.01, dtype)
     with jax.numpy_dtype_promotion("standard"):  # optax relies on it

@@ -251,8 +251,9 @@ def test_second_derivatives_take_the_penalty_as_linear(dtype):
 
 
 @pytest.mark.parametrize("in_jit", [False, True])
-def test_hessians_of_functions_of_the_penalty_keep_their_own_curvature(dtype, in_jit):
+def test_hessians_of_functions_of_the_penalty_keep_their_own_curvature(x64, in_jit):
     """Of f(E): f''(E) g g^T, with E counted as linear; the third derivative likewise."""
+    dtype = np.dtype("float32" if in_jit else "float64")
     vertices = as_jax(PAIR, dtype)
     one = jax.jit(loss) if in_jit else loss
 

@@ -23,6 +23,7 @@ def outputs(tmp_path, code):
     return notebook.cells[0].outputs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_notebook_shows_a_bar_unless_told_not_to(tmp_path, quiet):
     shown = outputs(tmp_path, BAR.format(quiet=quiet))

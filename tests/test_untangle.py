@@ -201,6 +201,7 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
     assert len(seen) >= 5 and any(np.isnan(volume) for _, _, volume in seen)
 
 
+@pytest.mark.slow
 def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
     """Every second descent ends nowhere, in a full turn and more, or at numbers that are none."""
     descend, calls = untangle._descend, []
@@ -217,6 +218,7 @@ def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
     assert all(np.isfinite(moved).all() for moved in calls) and len(calls) >= 2
 
 
+@pytest.mark.slow
 def test_each_pose_of_a_batch_says_how_it_ended(monkeypatch):
     descend = untangle._descend
 

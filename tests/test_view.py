@@ -119,6 +119,7 @@ def test_reset_comes_back_to_what_was_loaded(balls):
     np.testing.assert_array_equal(balls.vertices, loaded)
 
 
+@pytest.mark.slow
 def test_a_pose_comes_free_as_untangle_pose_says_and_every_step_is_shown(balls):
     bend(balls)
     start = balls.pose.copy()

@@ -183,6 +183,7 @@ def test_simple_solids_have_exactly_none(rng):
                 assert volume(turned, rays, directions) == 0
 
 
+@pytest.mark.slow
 def test_directions_agree_on_real_bodies():
     """At 512 x 512 the three directions against each other and against 2048 x 2048.
 

@@ -99,6 +99,7 @@ def test_same_bits_as_here_with_new_faces_and_options(pool, executor, monkeypatc
     assert len(answers) > before
 
 
+@pytest.mark.slow
 def test_released_workers_end_and_others_start(pool, executor):
     worker = until_ready(pool)
     pool.release()
@@ -115,6 +116,7 @@ def test_forgets_what_is_long_ago(pool, executor):
     check(pool, executor, batch(2), options)
 
 
+@pytest.mark.slow
 def test_one_that_dies_is_replaced_until_too_many_are_lost(pool, executor):
     for number in range(3):
         worker = until_ready(pool)
@@ -131,6 +133,7 @@ def test_one_that_dies_is_replaced_until_too_many_are_lost(pool, executor):
     assert len(pool._free) == 1
 
 
+@pytest.mark.slow
 def test_one_that_is_stopped_is_not_waited_for_and_given_up_in_the_end(pool, executor, monkeypatch):
     """What it was asked for is done here after much longer than usual; then it is not asked."""
     worker = until_ready(pool)
