@@ -36,7 +36,12 @@ def main() -> None:
         call = jax.jit(jax.value_and_grad(loss))
         return lambda: call(vertices)
 
-    classify = jax.jit(lambda v: spt_jax.classify_vertices(v, body.faces).label)
+    def classify(v):
+        found = spt_jax.classify_vertices(v, body.faces)
+        # Before its first release, VertexLabels had another field name.
+        return found.labels if hasattr(found, "labels") else found.label
+
+    classify = jax.jit(classify)
     calls = {
         "default": penalty(one, body.faces),
         "rays512": penalty(one, body.faces, rays=512, directions=1),

@@ -25,7 +25,7 @@ from benchmarks.paper_runs import (
     run_singles,
 )
 from spt_jax.body import BodyModel, load_body
-from spt_jax.classes import classify_vertices
+from spt_jax.labels import classify_vertices
 from spt_jax.output_files import ensure_folder
 from spt_jax.show import plot_curves, render_strip
 
@@ -135,7 +135,7 @@ def draw_singles(out: Path, body: BodyModel, singles: Singles) -> None:
         run = singles.runs[key]
         posed = [body(run.snapshots[i // EVERY]).vertices for i in SHOWN]
         labels = [
-            classify_vertices(v, faces, directions=1, rays=512, rule="triangle").label
+            classify_vertices(v, faces, directions=1, rays=512, rule="triangle").labels
             for v in posed
         ]
         titles = [f"{i}: SPT {run.values[i].mean():.4f}" for i in SHOWN]
@@ -172,7 +172,7 @@ def draw_pairs(out: Path, body: BodyModel, pairs: Pairs) -> None:
         posed,
         pairs.faces,
         [
-            classify_vertices(v, pairs.faces, directions=1, rays=512, rule="triangle").label
+            classify_vertices(v, pairs.faces, directions=1, rays=512, rule="triangle").labels
             for v in posed
         ],
         [

@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from spt_jax import paper_penalty, self_intersection_penalty
 from spt_jax.body import BodyModel, load_mocap
-from spt_jax.classes import classify_vertices
+from spt_jax.labels import classify_vertices
 
 RATE = 1e-4
 EVERY = 10  # the paper shows every tenth iteration

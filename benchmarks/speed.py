@@ -57,7 +57,7 @@ def main(settings: Settings) -> None:
     vertices = body(pose).vertices
     frames = np.linspace(0, len(mocap.names) - 1, 16).astype(int)
     batch = body(body.pose_from_smpl(jnp.asarray(mocap.pose[frames]))).vertices
-    labels = jax.jit(lambda v: classify_vertices(v, body.faces).label)
+    labels = jax.jit(lambda v: classify_vertices(v, body.faces).labels)
 
     def penalty(**options):
         return jax.jit(

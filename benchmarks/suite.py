@@ -80,7 +80,7 @@ def own_calls(vertices: jax.Array, faces: Any) -> dict[str, Callable[[], Any]]:
         )
         return lambda: call(vertices)
 
-    labels = jax.jit(lambda v: classify_vertices(v, faces).label)
+    labels = jax.jit(lambda v: classify_vertices(v, faces).labels)
     return {
         DEFAULT: penalty(),
         ONE: penalty(rays=RAYS, directions=1),

@@ -9,12 +9,12 @@ from spt_jax.body import load_body as load_body
 from spt_jax.body import load_mocap as load_mocap
 from spt_jax.caches import clear_caches as clear_caches
 from spt_jax.camera import PinholeCamera as PinholeCamera
-from spt_jax.classes import VertexClasses as VertexClasses
-from spt_jax.classes import classify_vertices as classify_vertices
 from spt_jax.groups import Scene as Scene
 from spt_jax.groups import between_groups as between_groups
 from spt_jax.groups import join_bodies as join_bodies
 from spt_jax.groups import within_groups as within_groups
+from spt_jax.labels import VertexLabels as VertexLabels
+from spt_jax.labels import classify_vertices as classify_vertices
 from spt_jax.mesh_check import MeshCheck as MeshCheck
 from spt_jax.mesh_check import check_mesh as check_mesh
 from spt_jax.penalty import paper_penalty as paper_penalty

@@ -6,8 +6,8 @@ from spt_jax.meshes.arrays import single_rounding as single_rounding
 from spt_jax.meshes.reading import MeshFile as MeshFile
 from spt_jax.meshes.reading import open_mesh as open_mesh
 from spt_jax.meshes.reading import read_mesh as read_mesh
-from spt_jax.meshes.writing import BODY_COLOUR as BODY_COLOUR
-from spt_jax.meshes.writing import IN_COLOUR as IN_COLOUR
-from spt_jax.meshes.writing import OUT_COLOUR as OUT_COLOUR
+from spt_jax.meshes.writing import BODY_COLOR as BODY_COLOR
+from spt_jax.meshes.writing import INVERTED_COLOR as INVERTED_COLOR
+from spt_jax.meshes.writing import PENETRATING_COLOR as PENETRATING_COLOR
 from spt_jax.meshes.writing import write_mesh as write_mesh
 from spt_jax.meshes.writing import write_shape as write_shape

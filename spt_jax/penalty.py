@@ -66,7 +66,7 @@ def self_intersection_penalty(
         gradient: "boundary", the derivative of the volume; "vertex", the paper's Eq. 9, which
             takes each triangle as wholly in or out; "unit", its Eq. 10, of length one at every
             vertex in self-intersection.
-        rule: how "ratio", "vertex" and "unit" class the vertices, as in `classify_vertices`.
+        rule: how "ratio", "vertex" and "unit" label the vertices, as in `classify_vertices`.
         rays: "auto": none. Everything is measured in closed form, to rounding, so the volume is
             smooth and its gradient exact, however the mesh is turned. (Should the sums of the
             closed form not close, which no mesh has been seen to do, 512 rays a side take over;
@@ -171,9 +171,9 @@ def paper_penalty(
 ) -> Float[Array, "*batch"]:
     """The paper to the letter: one direction, Algorithm 1, the ratio, Eq. 10 or 9.
 
-    The value is Eq. 11, the part of the vertices in V_out or V_in. The gradient is Eq. 10
-    (`normalize`) or Eq. 9. They are not each other's derivative, so a line search on this pair
-    fails; it is made for plain gradient descent. For anything else take
+    The value is Eq. 11, the fraction of the vertices that are penetrating or inverted (V_out or
+    V_in). The gradient is Eq. 10 (`normalize`) or Eq. 9. They are not each other's derivative, so a
+    line search on this pair fails; it is meant for plain gradient descent. For anything else use
     `self_intersection_penalty`.
 
     Args:

@@ -28,7 +28,7 @@ class IntersectionReport:
         directions: of the beams, unit vectors.
         volumes: the overlap volume that each direction gives; all the same where no rays were
             needed.
-        labels: 0 on V_0, +1 on V_out, -1 on V_in, as `classify_vertices`.
+        labels: +1 penetrating, -1 inverted, 0 clear, as from `classify_vertices`.
         crossing_pairs: pairs of triangles that intersect and count, and in all; those that only
             touch are none.
         rays: "auto", rays along the longer side of each screen, or (rows, columns), as asked for.
@@ -43,7 +43,7 @@ class IntersectionReport:
         >>> box = trimesh.creation.box()
         >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.3, 0.2]))
         >>> report = intersection_report(pair.vertices, pair.faces)
-        >>> report.intersects, report.num_out, report.as_dict()["vertices"]["in"]
+        >>> report.intersects, report.num_penetrating, report.as_dict()["num_inverted"]
         (True, 2, 0)
     """
 
@@ -60,23 +60,23 @@ class IntersectionReport:
     exact: bool
 
     @property
-    def num_out(self) -> int:
-        """Vertices in V_out: within another part of the surface."""
-        return count_labels(self.labels).out
+    def num_penetrating(self) -> int:
+        """The number of vertices inside another part of the surface (V_out)."""
+        return count_labels(self.labels).penetrating
 
     @property
-    def num_inside(self) -> int:
-        """Vertices in V_in: where the surface is inside out."""
-        return count_labels(self.labels).inside
+    def num_inverted(self) -> int:
+        """The number of vertices where the surface is inside out (V_in)."""
+        return count_labels(self.labels).inverted
 
     @property
     def num_clear(self) -> int:
-        """Vertices in V_0: in no self-intersection."""
+        """The number of vertices in no self-intersection (V_0)."""
         return count_labels(self.labels).clear
 
     @property
     def ratio(self) -> float:
-        """The part of the vertices in self-intersection (paper, Eq. 11)."""
+        """The fraction of the vertices in self-intersection (paper, Eq. 11)."""
         return count_labels(self.labels).ratio
 
     @property
@@ -94,7 +94,9 @@ class IntersectionReport:
             "crossing_pairs": {"counted": self.crossing_pairs[0], "all": self.crossing_pairs[1]},
             "solid_volume": self.solid_volume,
             "ratio": self.ratio,
-            "vertices": {"out": self.num_out, "in": self.num_inside, "clear": self.num_clear},
+            "num_penetrating": self.num_penetrating,
+            "num_inverted": self.num_inverted,
+            "num_clear": self.num_clear,
             "rays": list(self.rays) if isinstance(self.rays, tuple) else self.rays,
             "beams": [
                 {"direction": list(d), "volume": v, "crossings": n, "open_rays": o}
@@ -125,7 +127,9 @@ class IntersectionReport:
         table.add_row("solid volume", f"{self.solid_volume:.4g} unit³")
         table.add_row("ratio (Eq. 11)", f"{self.ratio:.3%} of {len(self.labels)} vertices")
         table.add_row(
-            "vertices", f"{self.num_out} V_out, {self.num_inside} V_in, {self.num_clear} V_0"
+            "vertices",
+            f"{self.num_penetrating} penetrating, {self.num_inverted} inverted, "
+            f"{self.num_clear} clear",
         )
         counted, pairs = self.crossing_pairs
         ignored = f", {pairs - counted} more that do not count" if pairs > counted else ""
@@ -150,7 +154,7 @@ def intersection_report(
     ignore_groups: Any = (),
     folds: RestSurface | None = None,
 ) -> IntersectionReport:
-    """What the penalty sees on one mesh: volume, ratio, classes, and how far to trust them.
+    """What the penalty sees on one mesh: volume, ratio, labels, and how far to trust them.
 
     The numbers are those of `self_intersection_penalty` and `classify_vertices`, measured in
     float64 whatever the dtype of the vertices. Where rays are cast, the spread between directions
@@ -161,7 +165,7 @@ def intersection_report(
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
         rays, directions: as in `self_intersection_penalty`.
-        rule: how the vertices are classed, as in `classify_vertices`.
+        rule: how the vertices are labelled, as in `classify_vertices`.
         face_groups, ignore_groups, folds: what does not count, as in `self_intersection_penalty`.
 
     Returns:
@@ -179,8 +183,10 @@ def intersection_report(
         >>> box = trimesh.creation.box()
         >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.5, 0.5]))
         >>> report = intersection_report(pair.vertices, pair.faces)
-        >>> print(f"{report.volume:.2f} of {report.solid_volume:.2f}, {report.num_out} vertices")
-        0.10 of 2.00, 2 vertices
+        >>> print(f"{report.volume:.2f} of {report.solid_volume:.2f}")
+        0.10 of 2.00
+        >>> report.num_penetrating
+        2
     """
     given, triangles = one_mesh(vertices, faces)
     points, triangles = np.asarray(given, np.float64), triangles.astype(np.int64)

@@ -119,4 +119,4 @@ def test_check_as_a_process(tmp_path):
     command = [sys.executable, "-m", "spt_jax", "check", path, "--rays", "64"]
     found = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert found.returncode == 1 and found.stderr == ""
-    assert "V_out" in found.stdout and "\x1b" not in found.stdout
+    assert "penetrating" in found.stdout and "\x1b" not in found.stdout

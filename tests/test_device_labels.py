@@ -1,4 +1,4 @@
-"""The device path's classes against the host's."""
+"""The device path's labels against the host's."""
 
 import jax
 import numpy as np
@@ -12,11 +12,11 @@ from spt_jax.overlap.surface import ExactSurface
 FRAMES = ["crawl/0092", "roll/0056", "run/0010"]
 
 
-def classes(vertices, faces, rule, backend="xla"):
-    return classify_vertices(vertices, faces, rays=48, rule=rule, backend=backend).label
+def labels(vertices, faces, rule, backend="xla"):
+    return classify_vertices(vertices, faces, rays=48, rule=rule, backend=backend).labels
 
 
-on_device = jax.jit(classes, static_argnums=2)
+on_device = jax.jit(labels, static_argnums=2)
 
 
 @pytest.mark.parametrize("name", SOLIDS)
@@ -24,7 +24,7 @@ def test_vertex_rule(name, dtype):
     mesh = padded(name, dtype)
     label = on_device(*mesh, "vertex")
     assert label.dtype == np.int8
-    np.testing.assert_array_equal(label, classes(*mesh, "vertex", "numpy"))
+    np.testing.assert_array_equal(label, labels(*mesh, "vertex", "numpy"))
     assert (name == "apart") == (not label.any())
 
 
@@ -32,14 +32,14 @@ def test_vertex_rule(name, dtype):
 def test_triangle_rule(name):
     mesh = padded(name, "float32")
     label = on_device(*mesh, "triangle")
-    np.testing.assert_array_equal(label, classes(*mesh, "triangle", "numpy"))
+    np.testing.assert_array_equal(label, labels(*mesh, "triangle", "numpy"))
     assert (name == "apart") == (not label.any())
 
 
 def test_vertex_rule_of_bodies():
     bodies = posed_bodies(FRAMES).astype(np.float32)
     label = on_device(bodies, body_faces().astype(np.int32), "vertex")
-    expected = classes(bodies, body_faces(), "vertex", "numpy")
+    expected = labels(bodies, body_faces(), "vertex", "numpy")
     # A vertex whose own triangles pass through each other has several numbers.
     for vertices, ours, hosts in zip(bodies, np.asarray(label), np.asarray(expected), strict=True):
         surface = ExactSurface(vertices.astype(float), body_faces(), 1.2e-7)
@@ -53,7 +53,7 @@ def test_vertices_by_a_hole():
     vertices, faces = padded("box in a box", "float32")
     some = faces.copy()
     some[2] = 0  # a hole in the outer box
-    expected = classes(vertices, some, "vertex", "numpy")
+    expected = labels(vertices, some, "vertex", "numpy")
     np.testing.assert_array_equal(on_device(vertices, some, "vertex"), expected)
     assert expected.any()
 

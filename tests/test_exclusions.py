@@ -147,7 +147,7 @@ def test_penalty_labels_and_report_agree_on_bodies(frame, x64):
     options = {"folds": embedded_body().rest_surface}
     report = intersection_report(vertices, faces, **options)
     value = float(self_intersection_penalty(jnp.asarray(vertices), faces, **options))
-    label = classify_vertices(jnp.asarray(vertices), faces, **options).label
+    label = classify_vertices(jnp.asarray(vertices), faces, **options).labels
     assert value == report.volume
     np.testing.assert_array_equal(report.labels, label)
     whole = intersection_report(vertices, faces)

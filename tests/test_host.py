@@ -83,10 +83,10 @@ def test_export_says_what_it_cannot_hold():
     shape = jax.ShapeDtypeStruct(vertices.shape, "float32")
     with pytest.raises(ValueError, match=r'jax.export cannot hold .* with backend="xla"'):
         jax.export.export(exact)(shape)
-    classes = jax.jit(lambda v: classify_vertices(v, faces, backend="xla").label)
-    exported = jax.export.export(classes)(shape)
+    labels = jax.jit(lambda v: classify_vertices(v, faces, backend="xla").labels)
+    exported = jax.export.export(labels)(shape)
     given = jnp.asarray(vertices, "float32")
-    np.testing.assert_array_equal(exported.call(given), classify_vertices(given, faces).label)
+    np.testing.assert_array_equal(exported.call(given), classify_vertices(given, faces).labels)
 
 
 def test_shard_map():

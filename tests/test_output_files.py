@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from spt_jax.mesh_files import (
-    BODY_COLOUR,
-    IN_COLOUR,
-    OUT_COLOUR,
+    BODY_COLOR,
+    INVERTED_COLOR,
+    PENETRATING_COLOR,
     as_mesh_arrays,
     read_mesh,
     write_mesh,
@@ -31,7 +31,7 @@ def labelled_cube():
     return vertices * np.pi, faces, np.array([0, 1, -1, 0, 0, 1, 0, -1], np.int8)
 
 
-COLOURS = {0: BODY_COLOUR, 1: OUT_COLOUR, -1: IN_COLOUR}
+COLOURS = {0: BODY_COLOR, 1: PENETRATING_COLOR, -1: INVERTED_COLOR}
 
 
 def test_ply_opens_elsewhere_with_the_same_colours(tmp_path):

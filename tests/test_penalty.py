@@ -74,20 +74,20 @@ def test_gradient_on_the_body_is_the_derivative_of_the_value(x64):
 
 @pytest.mark.parametrize("gradient", ["vertex", "unit"])
 def test_the_paper_s_pair(dtype, gradient):
-    """The ratio counts the classes; the gradient is Eq. 9 or 10 on them and zero elsewhere."""
+    """The ratio counts the labels; the gradient is Eq. 9 or 10 on them and zero elsewhere."""
     vertices = as_jax(PAIR, dtype)
     value, slope = jax.value_and_grad(
         lambda v: paper_penalty(v, FACES, rays=64, normalize=gradient == "unit")
     )(vertices)
-    classes = classify_vertices(vertices, FACES, rays=64, directions=1, rule="triangle")
-    assert value == pytest.approx(float(classes.ratio), rel=1e-6)
+    found = classify_vertices(vertices, FACES, rays=64, directions=1, rule="triangle")
+    assert value == pytest.approx(float(found.ratio), rel=1e-6)
     assert 0.05 < value < 0.5
     norm = np.linalg.norm(slope, axis=1)
-    np.testing.assert_array_equal(norm > 0, classes.out)
+    np.testing.assert_array_equal(norm > 0, found.penetrating)
     if gradient == "unit":
-        np.testing.assert_allclose(norm[np.asarray(classes.out)], 1.0, rtol=1e-5)
+        np.testing.assert_allclose(norm[np.asarray(found.penetrating)], 1.0, rtol=1e-5)
     outward = np.sum(slope[:HALF] * vertices[:HALF], axis=1)  # a unit sphere at the origin
-    assert (outward[np.asarray(classes.out[:HALF])] > 0).all()
+    assert (outward[np.asarray(found.penetrating[:HALF])] > 0).all()
 
 
 def test_descending_the_paper_s_gradient_separates_the_parts():

@@ -196,6 +196,6 @@ def test_a_crumpled_mesh_is_nan_and_the_report_says_why(monkeypatch, rng):
     crumpled = jnp.asarray(vertices, jnp.float32)
     value, gradient = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces))(crumpled)
     assert np.isnan(value) and not np.asarray(gradient).any()
-    assert not np.asarray(classify_vertices(crumpled, faces).label).any()
+    assert not np.asarray(classify_vertices(crumpled, faces).labels).any()
     with pytest.raises(ValueError, match=r"vertices must be a surface .* more than 1,000 pairs of"):
         intersection_report(vertices, faces)

@@ -74,14 +74,14 @@ def test_a_profile_is_the_winding_number_along_its_ray():
         ray = _telling_ray(found)
         along = profile(found, ray)
         np.testing.assert_array_equal(along.counter, counters)
-        np.testing.assert_array_equal(along.class_sign, classes)
+        np.testing.assert_array_equal(along.label, classes)
         assert (np.diff(along.depth) > 0).all()
     inverted = outer.copy()
     inverted.invert()
     found = cast_beam(inverted.vertices, inverted.faces, "front", 101)
     along = profile(found, _telling_ray(found))
     np.testing.assert_array_equal(along.counter, [-1, 0])
-    np.testing.assert_array_equal(along.class_sign, [-1, -1])
+    np.testing.assert_array_equal(along.label, [-1, -1])
     # Depth counts from the mesh's nearest point to its farthest.
     assert np.ptp(along.depth) == pytest.approx(2.0, abs=0.02)
     assert along.depth[0] == pytest.approx(0.0, abs=0.02)
@@ -112,9 +112,9 @@ def test_ray_pictures_show_overlap_where_there_is_some(balls, tmp_path):
     cut = plot_ray(vertices, faces, rays=80, size=size, unit="m")
     apart = vertices + 5.0 * (np.arange(len(vertices)) >= len(vertices) // 2)[:, None]
     clear = plot_ray(apart, faces, rays=80, size=size, unit="m")
-    assert near(cut, look.CLASSES[1]) > 500 and near(clear, look.CLASSES[1]) == 0
+    assert near(cut, look.LABEL_COLORS[1]) > 500 and near(clear, look.LABEL_COLORS[1]) == 0
     inside_out = plot_ray(apart, faces[:, ::-1], rays=80, size=size)
-    assert near(inside_out, look.CLASSES[-1]) > 500 and near(clear, look.CLASSES[-1]) == 0
+    assert near(inside_out, look.LABEL_COLORS[-1]) > 500 and near(clear, look.LABEL_COLORS[-1]) == 0
 
 
 @needs_drawing

@@ -21,7 +21,7 @@ NAMES = [
     "Scene",
     "UntangleMeshResult",
     "UntangleResult",
-    "VertexClasses",
+    "VertexLabels",
     "between_groups",
     "check_mesh",
     "classify_vertices",

@@ -225,13 +225,13 @@ def test_report_of_two_spheres_in_closed_form():
     seen = intersection_report(*pair, rays=512)
     assert seen.open_rays == (0, 0, 0) and min(seen.crossings) > 4e5
     assert seen.volume == pytest.approx(report.volume, rel=2e-3)
-    assert report.num_out + report.num_clear == len(pair[0]) and report.num_inside == 0
+    assert report.num_penetrating + report.num_clear == len(pair[0]) and report.num_inverted == 0
     assert report.intersects
 
 
 def test_report_sees_inverted_parts():
     report = intersection_report(*inverted(box()), rays=128)
-    assert report.num_inside == 8 and report.ratio == 1
+    assert report.num_inverted == 8 and report.ratio == 1
     assert report.volume == pytest.approx(1, rel=0.01)
     assert report.solid_volume == pytest.approx(-1)
 
@@ -242,9 +242,9 @@ def test_report_is_that_of_the_penalty(x64, rng):
     report = intersection_report(vertices, faces, rays=(90, 70), directions=directions)
     options = {"rays": (90, 70), "directions": directions}
     assert report.volume == float(self_intersection_penalty(vertices, faces, **options))
-    classes = classify_vertices(vertices, faces, **options)
-    np.testing.assert_array_equal(report.labels, classes.label)
-    assert report.ratio == pytest.approx(float(classes.ratio))
+    found = classify_vertices(vertices, faces, **options)
+    np.testing.assert_array_equal(report.labels, found.labels)
+    assert report.ratio == pytest.approx(float(found.ratio))
 
 
 def test_report_far_from_the_origin():
@@ -263,10 +263,10 @@ def test_report_counts_rays_through_holes():
 def test_report_as_table_and_as_json():
     report = intersection_report(*join(box(), box(center=(0.5, 0, 0))), rays=64, directions=1)
     text = str(report)
-    assert "overlap volume" in text and "unit³" in text and "V_out" in text
+    assert "overlap volume" in text and "unit³" in text and "penetrating" in text
     assert "\x1b" not in text and text == "\n".join(x.rstrip() for x in text.splitlines())
     found = json.loads(json.dumps(report.as_dict()))
-    assert found["volume"] == report.volume and found["vertices"]["out"] == report.num_out
+    assert found["volume"] == report.volume and found["num_penetrating"] == report.num_penetrating
     assert len(found["beams"]) == 1 and found["beams"][0]["open_rays"] == 0
 
 

@@ -57,7 +57,7 @@ def test_everybody_says_so(kind, rays, dtype):
     vertices = broken(kind, dtype)
     loss = lambda v: self_intersection_penalty(v, FACES, rays=rays)  # noqa: E731
     value, gradient = jax.value_and_grad(loss)(jnp.asarray(vertices))
-    labels = np.asarray(classify_vertices(jnp.asarray(vertices), FACES, rays=rays).label)
+    labels = np.asarray(classify_vertices(jnp.asarray(vertices), FACES, rays=rays).labels)
     scene = Scene.of_mesh(vertices, FACES, "boxes")
     scene.paper = rays != "auto"
     reading = scene.read()
@@ -68,7 +68,7 @@ def test_everybody_says_so(kind, rays, dtype):
         assert np.isnan(value)  # of a size whose cube is no float32, too
     if dtype == np.float32 and kind in MEASURED:
         measured = intersection_report(vertices, FACES, rays=rays)
-        assert measured.intersects and measured.crossing_pairs[0] > 0 and measured.num_out
+        assert measured.intersects and measured.crossing_pairs[0] > 0 and measured.num_penetrating
         assert reading.error is None and not reading.free
         assert untangle_mesh(vertices, FACES).after.volume <= measured.volume
         return

@@ -14,7 +14,7 @@ from helpers_body import PARENTS, ball_arrays, slow_rotation
 from spt_jax import cli, intersection_report, load_body, untangle_mesh, untangle_pose
 from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
 from spt_jax.body.poses import SMPL_LAYOUTS
-from spt_jax.mesh_files import OUT_COLOUR, read_mesh, write_mesh
+from spt_jax.mesh_files import PENETRATING_COLOR, read_mesh, write_mesh
 from spt_jax.view import files
 from spt_jax.view.freeing import untangle_scene
 from spt_jax.view.panel import figures
@@ -103,7 +103,10 @@ def test_a_reading_is_the_report(paper, count_folds):
     reading = scene.read()
     assert reading.volume == report.volume > 0
     assert reading.crossing_pairs == report.crossing_pairs[0]
-    assert (reading.counts.out, reading.counts.inside) == (report.num_out, report.num_inside)
+    assert (reading.counts.penetrating, reading.counts.inverted) == (
+        report.num_penetrating,
+        report.num_inverted,
+    )
     np.testing.assert_allclose(reading.counts.ratio, report.ratio)
     np.testing.assert_array_equal(reading.labels, report.labels)
 
@@ -170,8 +173,8 @@ def test_figures_say_what_was_measured(balls, pair_file):
     balls.name = "<b>"
     reading = balls.read()
     text = figures(reading, balls, "a & b")
-    assert f"{1e6 * reading.volume:.2f} cm³" in text and f">{reading.counts.out}<" in text
-    assert "&lt;b&gt;" in text and "a &amp; b" in text and f"rgb{OUT_COLOUR}" in text
+    assert f"{1e6 * reading.volume:.2f} cm³" in text and f">{reading.counts.penetrating}<" in text
+    assert "&lt;b&gt;" in text and "a &amp; b" in text and f"rgb{PENETRATING_COLOR}" in text
     mesh = files.open_file(pair_file)
     assert "unit³" in figures(mesh.read(), mesh, "")
 

@@ -43,7 +43,7 @@ def fit(
     Takes COCO's annotations and results, what MMPose, AlphaPose, Detectron2, Ultralytics and
     OpenPose write as JSON, and JSON or .npz files of this project
     ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
-    .glb of each person coloured by class, a picture of each image with the bodies over it, and
+    .glb of each person coloured by label, a picture of each image with the bodies over it, and
     report.json. The exit code is 1 if somebody could not be fitted, or if what was found lies
     outside any photograph. What is done is kept in OUT/unfinished until all is: a run that was
     ended goes on with the same command.

@@ -237,7 +237,7 @@ def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -
 def write_meshes(
     folder: Path, frames: Sequence[Frame], faces: Any, suffixes: Sequence[str]
 ) -> list[str]:
-    """Write each frame's meshes before and after, coloured by class; return the files' names."""
+    """Write each frame's meshes before and after, coloured by label; return the files' names."""
     from spt_jax.mesh_files import write_mesh
 
     names, written = _file_names(frames), []

@@ -55,7 +55,7 @@ def untangle(
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
             0.04 on fingers.
-        meshes: write a .glb of each frame before and after, coloured by class.
+        meshes: write a .glb of each frame before and after, coloured by label.
         rays: "auto", or rays along the longer side of each of the three beams; the search uses
             half as many.
         anew: throw away what is done of an unfinished run in the folder.

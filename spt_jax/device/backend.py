@@ -1,4 +1,4 @@
-"""The penalty and the classes on the device, for batches of any shape, one mesh after the other."""
+"""The penalty and the labels on the device, for batches of any shape, one mesh after the other."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -69,7 +69,7 @@ def labels_on_device(
     faces: Integer[Array, "F 3"],
     task: Task,
 ) -> Int[Array, "*batch V"]:
-    """The classes of every mesh's vertices; 0 where the mesh cannot be measured."""
+    """The labels of every mesh's vertices; 0 where the mesh cannot be measured."""
     return over_batch(_mapped(_labels_of_one, task.program), vertices, faces, task.tables)
 
 

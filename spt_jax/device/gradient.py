@@ -8,7 +8,7 @@ from spt_jax.device.levels import Intervals
 from spt_jax.device.strips import Ray
 
 # Labels while they are collected: of several the largest is taken.
-_CODE_INSIDE, _CODE_OUT = 1, 2
+_CODE_INVERTED, _CODE_PENETRATING = 1, 2
 
 
 def boundary_gradient(
@@ -37,15 +37,15 @@ def boundary_gradient(
 def add_codes(
     codes: Int[Array, "V"], faces: Int[Array, "F 3"], intervals: Intervals
 ) -> Int[Array, "V"]:
-    """What the triangle rule says of the ends' corners: V_out before V_in before V_0."""
+    """Apply the triangle rule to the ends' corners: penetrating, then inverted, then clear."""
     outer = jnp.repeat(intervals.outer, 6)
-    code = jnp.where(outer > 0, _CODE_OUT, jnp.where(outer < 0, _CODE_INSIDE, 0))
+    code = jnp.where(outer > 0, _CODE_PENETRATING, jnp.where(outer < 0, _CODE_INVERTED, 0))
     return codes.at[take(faces, intervals.ends.reshape(-1)).reshape(-1)].max(code)
 
 
 def as_labels(codes: Int[Array, "V"]) -> Int[Array, "V"]:
-    """The codes as classes: +1 V_out, -1 V_in, 0 V_0."""
-    return jnp.where(codes == _CODE_OUT, 1, jnp.where(codes == _CODE_INSIDE, -1, 0))
+    """The codes as labels: +1 penetrating, -1 inverted, 0 clear."""
+    return jnp.where(codes == _CODE_PENETRATING, 1, jnp.where(codes == _CODE_INVERTED, -1, 0))
 
 
 def vertex_gradient(

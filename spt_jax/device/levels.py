@@ -24,8 +24,8 @@ class Intervals(NamedTuple):
         ends: the triangles that each interval begins and ends at.
         around: the triangles that open and close the solid around it; -1 where none does.
         barycentric: of the points where the ray crosses `ends`.
-        outer: w_out at both ends, which is the interval's level less one: positive on V_out,
-            negative on V_in, 0 at unused places.
+        outer: w_out at both ends, which is the interval's level less one: positive on penetrating
+            sheets, negative on inverted ones, 0 at unused places.
         length: from end to end, in the mesh's unit; 0 at unused places. The interval counts
             |w_out| times.
     """

@@ -54,7 +54,7 @@ def generic_frames(directions: Directions) -> Float[np.ndarray, "D 3 3"]:
 def vertex_labels(
     vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], frames: Float[Array, "D 3 3"]
 ) -> Int[Array, "V"]:
-    """The class sign(w_out) of every vertex: 0 on V_0, +1 on V_out, -1 on V_in.
+    """The label sign(w_out) of every vertex: +1 penetrating, -1 inverted, 0 clear.
 
     The first of the frames (`generic_frames`) serves all vertices; the next ones those whose ray
     met a hole. A vertex that none decides is 0, and so is one that no triangle uses.

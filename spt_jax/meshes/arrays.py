@@ -38,13 +38,13 @@ def as_mesh_arrays(
             f"faces must index into vertices: got index {low if low < 0 else high} for "
             f"{len(points)} vertices; indices are 0-based"
         )
-    classes = np.zeros(len(points), np.int8) if labels is None else np.asarray(labels)
-    if classes.shape != (len(points),) or not np.isin(classes, (-1, 0, 1)).all():
+    label = np.zeros(len(points), np.int8) if labels is None else np.asarray(labels)
+    if label.shape != (len(points),) or not np.isin(label, (-1, 0, 1)).all():
         raise ValueError(
             f"labels must be 0, +1 or -1 for each of {len(points)} vertices: got "
-            f"{classes.dtype} {classes.shape} with values {np.unique(classes)[:5]}"
+            f"{label.dtype} {label.shape} with values {np.unique(label)[:5]}"
         )
-    return points.astype(np.float64), triangles.astype(np.int64), classes.astype(np.int8)
+    return points.astype(np.float64), triangles.astype(np.int64), label.astype(np.int8)
 
 
 def single_rounding(vertices: Float[np.ndarray, "V 3"]) -> float:

@@ -1,4 +1,4 @@
-"""Meshes written to files: coloured by class to be looked at, or to the last digit."""
+"""Meshes written to files: coloured by label to be looked at, or to the last digit."""
 
 import os
 from pathlib import Path
@@ -12,9 +12,9 @@ from spt_jax.output_files import atomic_write
 
 from .arrays import as_mesh_arrays, fits_single, single_rounding
 
-BODY_COLOUR = (213, 201, 188)
-OUT_COLOUR = (222, 58, 24)
-IN_COLOUR = (0, 114, 178)
+BODY_COLOR = (213, 201, 188)
+PENETRATING_COLOR = (222, 58, 24)
+INVERTED_COLOR = (0, 114, 178)
 
 
 def write_mesh(
@@ -25,10 +25,11 @@ def write_mesh(
 ) -> None:
     """Write a mesh as .glb or .ply, atomically, with one colour a vertex that other programs show.
 
-    V_0 is warm grey, V_out (+1) vermillion, V_in (-1) blue. A .ply stores positions as float32
-    where that holds all of them exactly, else as float64. A .glb, which knows float32 alone, stores
-    them so; of a mesh far from the origin about its middle, and that as a node's translation. glTF
-    defines vertex colours as linear light, so a .glb holds the same colours linearised.
+    Clear vertices are warm grey, penetrating ones (+1) vermillion, inverted ones (-1) blue. A .ply
+    stores positions as float32 where that holds all of them exactly, else as float64. A .glb, which
+    knows float32 alone, stores them so; of a mesh far from the origin about its middle, and that as
+    a node's translation. glTF defines vertex colours as linear light, so a .glb holds the same
+    colours linearised.
 
     Args:
         path: the file; its suffix chooses the format.
@@ -57,8 +58,8 @@ def write_mesh(
     suffix = Path(path).suffix.lower()
     if suffix not in (".glb", ".ply"):
         raise ValueError(f"path must end in .glb or .ply: got {str(path)!r}")
-    points, triangles, classes = as_mesh_arrays(vertices, faces, labels)
-    colours = np.array([BODY_COLOUR, OUT_COLOUR, IN_COLOUR], dtype=np.uint8)[classes]
+    points, triangles, label = as_mesh_arrays(vertices, faces, labels)
+    colours = np.array([BODY_COLOR, PENETRATING_COLOR, INVERTED_COLOR], dtype=np.uint8)[label]
     if suffix == ".glb":
         colours = _linear_light(colours)
     rgba = np.concatenate([colours, np.full((len(colours), 1), 255, np.uint8)], axis=1)

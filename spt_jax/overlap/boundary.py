@@ -3,7 +3,7 @@
 Moving the surface with velocity v changes the overlap volume, the integral of w (w - 1) / 2, by
 that of w_out (v . n) over the surface: a point that it sweeps goes from w_out to w_out + 1. With
 linear triangles the gradient at vertex t is the sum over its triangles of n times the integral of
-w_out lambda_t; where w_out is the same all around t, and 0, 1 or -1, which is the class of
+w_out lambda_t; where w_out is the same all around t, and 0, 1 or -1, which is the label of
 Algorithm 1, that is the paper's Eq. 9. Rays are a quadrature of the integral: a crossing stands
 for the surface area a / |n . d| of its triangle.
 """

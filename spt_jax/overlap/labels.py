@@ -1,4 +1,4 @@
-"""V_0, V_out and V_in: Algorithm 1's rule, by triangles (paper, section 3.2)."""
+"""Labels of vertices, and the triangle rule of the paper's Algorithm 1 (section 3.2)."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,10 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.rays.levels import Overlaps
 
-CLEAR, OUT, INSIDE = 0, 1, -1
+# The paper's V_0, V_out and V_in: the sign of the winding number just outside the surface.
+CLEAR, PENETRATING, INVERTED = 0, 1, -1
 
-# A triangle of which no larger part than this lies in an overlap touches it at most.
+# A triangle with at most this fraction of its area in an overlap only touches it.
 _SLIVER = 1e-9
 
 
@@ -17,31 +18,34 @@ class LabelCounts(NamedTuple):
     """How many vertices have each label."""
 
     clear: int
-    out: int
-    inside: int
+    penetrating: int
+    inverted: int
 
     @property
     def ratio(self) -> float:
-        """The part of the vertices in self-intersection (paper, Eq. 11)."""
+        """The fraction of the vertices in self-intersection (paper, Eq. 11)."""
         return 1.0 - self.clear / max(sum(self), 1)
 
 
 def count_labels(label: Int[np.ndarray, "V"]) -> LabelCounts:
-    """The vertices of V_0, V_out and V_in."""
-    return LabelCounts(*(int(np.count_nonzero(label == value)) for value in (CLEAR, OUT, INSIDE)))
+    """Count the clear, penetrating and inverted vertices."""
+    return LabelCounts(
+        *(int(np.count_nonzero(label == value)) for value in (CLEAR, PENETRATING, INVERTED))
+    )
 
 
 def triangle_labels(
     faces: Int[np.ndarray, "F 3"], overlaps: list[Overlaps], num_vertices: int
 ) -> Int[np.ndarray, "V"]:
-    """Each vertex takes the class of the triangles around it: +1 V_out, -1 V_in, 0 V_0.
+    """Each vertex takes the label of the triangles around it.
 
-    The paper appends a triangle's corners to a set at every crossing and does not say what a
-    vertex is that lands in several. Here V_out goes before V_in and both go before V_0, so the
-    ratio vanishes only when no ray sees an overlap. A vertex that no ray reaches is V_0.
+    The paper adds a triangle's corners to a set at every crossing and does not say how to label a
+    vertex that lands in several sets. Here penetrating takes precedence over inverted, and both
+    over clear, so the ratio vanishes only if no ray sees an overlap. A vertex that no ray reaches
+    is clear.
     """
     label = np.zeros(num_vertices, np.int8)
-    for value in (INSIDE, OUT):
+    for value in (INVERTED, PENETRATING):
         for found in overlaps:
             label[faces[found.ends[np.sign(found.outer) == value]]] = value
     return label
@@ -54,20 +58,20 @@ def add_labels_without_rays(
     winding: Int[np.ndarray, "H 3"],
     area: Float[np.ndarray, "H"],
 ) -> None:
-    """Add what the same rule says of some faces, as if rays went through every point.
+    """Apply the triangle rule to some faces, as if a ray went through every point of them.
 
     Args:
-        label: to be added to.
+        label: changed in place.
         faces: of the mesh.
-        found: faces that bound overlaps.
-        winding: w_out at the corners of these.
-        area: the integral of w_out over each, as a part of its area.
+        found: faces that bound overlap regions.
+        winding: w_out at their corners.
+        area: the integral of w_out over each, as a fraction of its area.
     """
     corners = faces[found]
-    # A triangle cut between its corners has the class of what is cut off it.
+    # A triangle that is cut between its corners takes the label of the piece that is cut off.
     part = np.where(winding.any(axis=1), 0.0, area)
-    inside, out = np.zeros(len(label), bool), label == OUT
-    inside[corners[(winding < 0).any(axis=1) | (part < -_SLIVER)]] = True
-    out[corners[(winding > 0).any(axis=1) | (part > _SLIVER)]] = True
-    label[inside] = INSIDE
-    label[out] = OUT
+    inverted, penetrating = np.zeros(len(label), bool), label == PENETRATING
+    inverted[corners[(winding < 0).any(axis=1) | (part < -_SLIVER)]] = True
+    penetrating[corners[(winding > 0).any(axis=1) | (part > _SLIVER)]] = True
+    label[inverted] = INVERTED
+    label[penetrating] = PENETRATING

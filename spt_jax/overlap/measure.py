@@ -181,7 +181,7 @@ class Measurement:
         return self.surface.count_pairs(self.surface.listed)
 
     def labels(self, rule: Rule) -> Int[np.ndarray, "V"]:
-        """V_0, V_out and V_in of the overlaps that count.
+        """The labels of the vertices, of the overlaps that count.
 
         By each vertex itself, or by Algorithm 1's triangle rule over all beams.
         """

@@ -66,7 +66,7 @@ def render_arrows(
     """
     check_png(path)
     check_size(size)
-    points, triangles, classes = as_mesh_arrays(vertices, faces, labels)
+    points, triangles, label = as_mesh_arrays(vertices, faces, labels)
     given = np.asarray(vectors, np.float64)
     if given.shape != points.shape or not np.isfinite(given).all():
         raise ValueError(
@@ -76,13 +76,13 @@ def render_arrows(
     if most < 1:
         raise ValueError(f"most must be at least 1: got {most!r}.")
     aspect = size[0] / size[1]
-    camera = frame([points], triangles, [classes], view, aspect)
+    camera = frame([points], triangles, [label], view, aspect)
     pointed = given.any(axis=1)
     if close_up and pointed.any():
         camera = _closer(camera, points[pointed], aspect)
     kept = _spread_out(points, given, most)
     with panel_plotter(*size) as plotter:
-        picture = draw_panel(plotter, points, triangles, classes, camera)
+        picture = draw_panel(plotter, points, triangles, label, camera)
         if kept.any():
             over = _draw_arrows(plotter, points[kept], given[kept], camera, size)
             opacity = over[..., 3:] / 255

@@ -110,8 +110,8 @@ def _best_azimuth(
     # picture element's nearest centroid stands for the surface: no rendering is needed. Ties, and
     # gains under a third, go to the direction nearer the front.
     scores = np.zeros(len(_AZIMUTHS))
-    for vertices, classes in zip(meshes, labels, strict=True):
-        marked = marked_triangles(classes, faces)
+    for vertices, label in zip(meshes, labels, strict=True):
+        marked = marked_triangles(label, faces)
         if not marked.any():
             continue
         corners = vertices[faces]

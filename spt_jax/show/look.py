@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
+from spt_jax.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.output_files import atomic_write
 from spt_jax.show.offscreen import import_extra
 
@@ -49,8 +49,12 @@ def hex_colour(rgb: tuple[int, int, int]) -> str:
     return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
-#: Of the classes V_0, V_out and V_in, by the class's sign.
-CLASSES = {0: hex_colour(BODY_COLOUR), 1: hex_colour(OUT_COLOUR), -1: hex_colour(IN_COLOUR)}
+#: Colours of clear, penetrating and inverted vertices, by label.
+LABEL_COLORS = {
+    0: hex_colour(BODY_COLOR),
+    1: hex_colour(PENETRATING_COLOR),
+    -1: hex_colour(INVERTED_COLOR),
+}
 
 
 def blank_figure(width: int, height: int) -> tuple[Any, Any]:

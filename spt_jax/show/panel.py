@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
+from spt_jax.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.show.framing import Framing, marked_triangles
 from spt_jax.show.look import BACKGROUND, LIGHTS, MATERIAL
 from spt_jax.show.offscreen import import_extra, offscreen_plotter
@@ -53,7 +53,7 @@ def draw_panel(
     marked = marked_triangles(labels, faces)
     out = (labels[faces] > 0).any(axis=1)
     kind = marked * np.where(out, 1, 2)
-    colours = np.array([BODY_COLOUR, OUT_COLOUR, IN_COLOUR], np.uint8)[kind]
+    colours = np.array([BODY_COLOR, PENETRATING_COLOR, INVERTED_COLOR], np.uint8)[kind]
     normals = vertex_normals(vertices, faces)
     body = _add_surface(plotter, vertices, faces, normals, colours)
     plotter.render()  # screenshot alone would return what was drawn last

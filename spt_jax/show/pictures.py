@@ -31,10 +31,10 @@ def render_mesh(
 ) -> Picture:
     """Return a picture of one mesh, with its labelled triangles seen through the rest.
 
-    A triangle is coloured when all of its vertices are labelled, or one that would otherwise not be
-    seen: V_out (+1) vermillion, before V_in (-1) blue. Overlapping parts hide each other, so
-    coloured triangles are drawn a second time over the finished picture: what lies inside the body
-    shows as a fainter spot.
+    A triangle is coloured if all of its vertices are labelled, or if one is that would otherwise
+    not show: penetrating (+1) vermillion, otherwise inverted (-1) blue. Overlapping parts hide each
+    other, so coloured triangles are drawn a second time over the finished picture: what lies inside
+    the body shows as a fainter spot.
 
     Args:
         vertices: positions, in any unit; the picture is fitted to them.
@@ -169,8 +169,8 @@ def render_strip(
             f"rows of {[len(row) for row in meshes]}"
         )
     rows = [
-        [as_mesh_arrays(*panel) for panel in zip(row, [faces] * len(row), classes, strict=True)]
-        for row, classes in zip(meshes, labels, strict=True)
+        [as_mesh_arrays(*panel) for panel in zip(row, [faces] * len(row), label, strict=True)]
+        for row, label in zip(meshes, labels, strict=True)
     ]
     columns = max(len(row) for row in rows)
     for name, entries, count in (

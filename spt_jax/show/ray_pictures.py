@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from spt_jax.show.framing import View
 from spt_jax.show.look import (
     BACKGROUND,
-    CLASSES,
     INK,
+    LABEL_COLORS,
     PAPER,
     Picture,
     blank_figure,
@@ -25,7 +25,7 @@ from spt_jax.show.look import (
 from spt_jax.show.rays import BeamCast, RayProfile, cast_beam, profile, ray_images
 
 _COUNTS = ("#dfe6ea", "#7fb4d6", "#0072b2", "#003a5c", "#001a2b")
-_LENGTHS = ("#f0b8a6", CLASSES[1], "#4d1005")
+_LENGTHS = ("#f0b8a6", LABEL_COLORS[1], "#4d1005")
 _BODY = "#d8d1c8"  # crossed, without overlap
 _TRIPLE = "#7d1d0a"
 _NAMES = {0: "crossing, $V_0$", 1: "crossing, $V_{out}$", -1: "crossing, $V_{in}$"}
@@ -122,7 +122,7 @@ def plot_ray(
     Of the rays that lie in overlaps for at least half as long as any, or, where nothing overlaps,
     of those that cross most triangles, it is the one whose crossings are farthest apart. The
     counter rises where the ray enters the surface and falls where it leaves it: it is the winding
-    number. Crossings are coloured by their class: V_0, V_out, V_in.
+    number. Crossings are coloured by their label.
 
     Args:
         vertices: positions, in any unit.
@@ -197,7 +197,7 @@ def _draw_cut(axes: Any, found: BeamCast, ray: int, along: RayProfile, aspect: f
     np.add.at(steps, (columns[chosen], place), found.crossings.sign[chosen])
     winding = np.cumsum(steps, axis=1)[:, :-1]
     pixel = found.beam.pixel[0]
-    colours = [CLASSES[-1], hex_colour(BACKGROUND), CLASSES[0], CLASSES[1], _TRIPLE]
+    colours = [LABEL_COLORS[-1], hex_colour(BACKGROUND), LABEL_COLORS[0], LABEL_COLORS[1], _TRIPLE]
     axes.imshow(
         winding,
         cmap=ListedColormap(colours),
@@ -215,7 +215,7 @@ def _draw_cut(axes: Any, found: BeamCast, ray: int, along: RayProfile, aspect: f
     axes.annotate(
         "", (high, 0), (high - pad / 2, 0), arrowprops={"arrowstyle": "-|>", "color": INK}
     )
-    _draw_crossings(axes, along.depth, np.zeros(len(along.depth)), along.class_sign)
+    _draw_crossings(axes, along.depth, np.zeros(len(along.depth)), along.label)
     from matplotlib.patches import Patch
 
     levels = {
@@ -240,23 +240,23 @@ def _draw_counter(axes: Any, along: RayProfile) -> None:
     x = np.concatenate([[low], along.depth, [high]])
     counter = np.concatenate([[0], along.counter, [0]])
     twice, inverted = np.maximum(counter, 1), np.minimum(counter, 0)
-    axes.fill_between(x, 1, twice, step="post", color=CLASSES[1], alpha=0.35, linewidth=0)
-    axes.fill_between(x, 0, inverted, step="post", color=CLASSES[-1], alpha=0.35, linewidth=0)
+    axes.fill_between(x, 1, twice, step="post", color=LABEL_COLORS[1], alpha=0.35, linewidth=0)
+    axes.fill_between(x, 0, inverted, step="post", color=LABEL_COLORS[-1], alpha=0.35, linewidth=0)
     axes.step(x, counter, where="post", color=INK, linewidth=1.8)
     before = counter[:-2]
-    _draw_crossings(axes, along.depth, (before + along.counter) / 2, along.class_sign)
+    _draw_crossings(axes, along.depth, (before + along.counter) / 2, along.label)
     lowest, highest = min(int(counter.min()), 0), max(int(counter.max()), 1)
     axes.set(ylim=(lowest - 0.35, highest + 0.5), yticks=np.arange(lowest, highest + 1))
     axes.set_ylabel("counter = winding number")
     axes.legend(loc="upper right", ncols=3, **_LEGEND)
 
 
-def _draw_crossings(axes: Any, x: Any, y: Any, classes: Int[np.ndarray, "N"]) -> None:
+def _draw_crossings(axes: Any, x: Any, y: Any, labels: Int[np.ndarray, "N"]) -> None:
     for sign in (0, 1, -1):
-        of_class = classes == sign
-        if of_class.any():
-            style = {"facecolor": CLASSES[sign] if sign else PAPER, "edgecolor": INK, "s": 52}
-            axes.scatter(x[of_class], y[of_class], zorder=4, label=_NAMES[sign], **style)
+        chosen = labels == sign
+        if chosen.any():
+            style = {"facecolor": LABEL_COLORS[sign] if sign else PAPER, "edgecolor": INK, "s": 52}
+            axes.scatter(x[chosen], y[chosen], zorder=4, label=_NAMES[sign], **style)
 
 
 _LEGEND: dict[str, Any] = {"labelcolor": INK, "framealpha": 0.9, "edgecolor": "none"}

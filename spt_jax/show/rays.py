@@ -111,8 +111,8 @@ def cast_beam(vertices: Any, faces: Any, view: View, rays: int) -> BeamCast:
         raise TypeError(f"rays must be a whole number: got {rays!r}.")
     if not 1 <= rays <= _MOST_RAYS:
         raise ValueError(f"rays must be from 1 to {_MOST_RAYS} a side: got {rays!r}.")
-    points, triangles, classes = as_mesh_arrays(vertices, faces)
-    axes = frame([points], triangles, [classes], view, 1.0).axes
+    points, triangles, labels = as_mesh_arrays(vertices, faces)
+    axes = frame([points], triangles, [labels], view, 1.0).axes
     axes = axes * [[1.0], [1.0], [-1.0]]  # a beam's third axis is where its rays go
     extent = np.ptp(points @ axes[:2].T, axis=0).max()
     pixel = np.full(2, extent / rays if extent > 0 else 1.0)
@@ -130,16 +130,16 @@ class RayProfile(NamedTuple):
     Attributes:
         depth: of each crossing along the ray, from the mesh's nearest point.
         counter: the winding number behind each crossing.
-        class_sign: of each crossing: 0 on V_0, +1 on V_out, -1 on V_in.
+        label: of each crossing: +1 penetrating, -1 inverted, 0 clear.
     """
 
     depth: Float[np.ndarray, "N"]
     counter: Int[np.ndarray, "N"]
-    class_sign: Int[np.ndarray, "N"]
+    label: Int[np.ndarray, "N"]
 
 
 def profile(found: BeamCast, ray: int) -> RayProfile:
-    """The counter along one ray (paper, Algorithm 1), and the class of each of its crossings."""
+    """The counter along one ray (paper, Algorithm 1), and the label of each of its crossings."""
     chosen = np.flatnonzero(found.crossings.ray == ray)
     counter = winding_numbers(found.crossings)[chosen]
     # The winding number outside a sheet is the smaller of those on its two sides.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from spt_jax.body import BodyModel
 from spt_jax.fit.terms.spheres import BodySpheres, sphere_depths
-from spt_jax.mesh_files import OUT_COLOUR
+from spt_jax.mesh_files import PENETRATING_COLOR
 from spt_jax.show.framing import View, frame
 from spt_jax.show.look import GAP, MATERIAL, Picture, check_png, check_size, finished
 from spt_jax.show.offscreen import import_extra
@@ -81,7 +81,7 @@ def render_spheres(
     # By the part's place in the order of parts, so that parent and child differ mostly.
     _, place = np.unique(spheres.part, return_inverse=True)
     colours = np.where(
-        colliding[:, None], np.array(OUT_COLOUR, np.uint8), _COLOURS[place % len(_COLOURS)]
+        colliding[:, None], np.array(PENETRATING_COLOR, np.uint8), _COLOURS[place % len(_COLOURS)]
     )
     owner = np.repeat(np.arange(len(radii)), len(ball.faces))
 

@@ -103,7 +103,7 @@ class Place:
 
     @cached_property
     def labels(self) -> Int[np.ndarray, "V"]:
-        """V_0, V_out and V_in."""
+        """The labels of the vertices."""
         return self.found.labels("vertex")
 
     @property

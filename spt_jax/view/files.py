@@ -140,7 +140,7 @@ def mocap_for(body: BodyModel) -> dict[str, Frames]:
 
 
 def mesh_bytes(scene: Scene, reading: Reading) -> bytes:
-    """The surface as a .glb, coloured by class."""
+    """The surface as a .glb, coloured by label."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.glb"
         write_mesh(path, reading.vertices, scene.faces, reading.labels)

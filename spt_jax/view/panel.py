@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from spt_jax.mesh_files import IN_COLOUR, OUT_COLOUR
+from spt_jax.mesh_files import INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.view.files import Frames
 from spt_jax.view.scene import Reading, Scene, body_parts
 
@@ -39,7 +39,10 @@ class Panel:
         self._parts = body_parts(scene.body.joint_names) if scene.body else {}
         self._gui.reset()
         self._gui.configure_theme(
-            show_logo=False, show_share_button=False, brand_color=OUT_COLOUR, control_width="medium"
+            show_logo=False,
+            show_share_button=False,
+            brand_color=PENETRATING_COLOR,
+            control_width="medium",
         )
         self._gui.set_panel_label("spt-jax view")
         self._gui.main_panel.dock_right()
@@ -213,8 +216,8 @@ def figures(reading: Reading, scene: Scene, status: str) -> str:
     large_name, small_name = ("ratio (Eq. 11)", "overlap volume")[:: 1 if scene.paper else -1]
     rows = [
         (small_name, small),
-        (f"{_dot(OUT_COLOUR)} within another part, V<sub>out</sub>", f"{reading.counts.out}"),
-        (f"{_dot(IN_COLOUR)} inside out, V<sub>in</sub>", f"{reading.counts.inside}"),
+        (f"{_dot(PENETRATING_COLOR)} penetrating", f"{reading.counts.penetrating}"),
+        (f"{_dot(INVERTED_COLOR)} inverted", f"{reading.counts.inverted}"),
         ("triangle pairs that intersect", f"{reading.crossing_pairs}"),
         ("measured in", f"{reading.milliseconds:.0f} ms"),
     ]

@@ -33,7 +33,7 @@ class Reading:
 
     Attributes:
         vertices: the positions that were measured.
-        labels: 0 on V_0, +1 on V_out, -1 on V_in.
+        labels: +1 penetrating, -1 inverted, 0 clear.
         volume: the overlap volume that counts, in the cube of the vertices' unit.
         crossing_pairs: pairs of triangles that intersect and count.
         milliseconds: that measuring took.
@@ -55,7 +55,7 @@ class Reading:
 
     @property
     def counts(self) -> LabelCounts:
-        """Vertices of V_0, V_out and V_in."""
+        """The numbers of clear, penetrating and inverted vertices."""
         return count_labels(self.labels)
 
 

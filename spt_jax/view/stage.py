@@ -1,4 +1,4 @@
-"""The 3D side of the live view: the surface in the colours of its classes, and the handles."""
+"""The 3D side of the live view: the surface in the colours of its labels, and the handles."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.mesh_files import BODY_COLOUR, IN_COLOUR, OUT_COLOUR
-from spt_jax.overlap.labels import OUT
+from spt_jax.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
+from spt_jax.overlap.labels import PENETRATING
 from spt_jax.show.framing import frame, marked_triangles
 from spt_jax.show.look import BACKGROUND
 from spt_jax.view.scene import Reading, Scene
@@ -19,7 +19,9 @@ _FLOOR_COLOUR, _LINE_COLOUR = (238, 235, 229), (226, 221, 213)
 # A narrow view, from as far as it takes: limbs near the camera look no larger than they are.
 _FIELD_OF_VIEW = 0.5  # radians, of the height
 
-_CLEAR, _OUT, _IN = "/surface/clear", "/surface/out", "/surface/in"
+_CLEAR, _PENETRATING, _INVERTED = (
+    f"/surface/{label}" for label in ("clear", "penetrating", "inverted")
+)
 # Drawn first, in no colour at all, it hides all but the surface's front layer: transparent
 # triangles are not sorted, and those behind would show through in patches.
 _VEIL = "/surface/veil"
@@ -72,12 +74,12 @@ class Stage:
     def show(self, reading: Reading, faces: Int[np.ndarray, "F 3"]) -> None:
         """Draw the surface that was measured."""
         marked = marked_triangles(reading.labels, faces)
-        out = marked & (reading.labels[faces] == OUT).any(axis=1)
+        penetrating = marked & (reading.labels[faces] == PENETRATING).any(axis=1)
         with self._server.atomic():
             for chosen, colour, names in (
-                (~marked, BODY_COLOUR, (_VEIL, _CLEAR)),
-                (out, OUT_COLOUR, (_OUT,)),
-                (marked & ~out, IN_COLOUR, (_IN,)),
+                (~marked, BODY_COLOR, (_VEIL, _CLEAR)),
+                (penetrating, PENETRATING_COLOR, (_PENETRATING,)),
+                (marked & ~penetrating, INVERTED_COLOR, (_INVERTED,)),
             ):
                 self._draw(reading.vertices, faces[chosen], colour, names)
             self.set_see_through(self.see_through)
@@ -87,7 +89,9 @@ class Stage:
         self.see_through = wanted
         if self._meshes:
             # Without overlap there is nothing to see, and an opaque surface is crisper.
-            veiled = wanted and any(self._meshes[name].visible for name in (_OUT, _IN))
+            veiled = wanted and any(
+                self._meshes[name].visible for name in (_PENETRATING, _INVERTED)
+            )
             self._meshes[_VEIL].visible = veiled and self._meshes[_CLEAR].visible
             self._meshes[_CLEAR].opacity = _OPACITY if veiled else None
 

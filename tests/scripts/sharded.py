@@ -45,7 +45,7 @@ check(jax.jit(jax.grad(lambda v: penalty(v).sum()))(sharded), expected[1])
 lists = jax.jit(jax.vmap(with_faces))
 check(lists(sharded, jnp.stack([jnp.asarray(PAIR.faces)] * 8)), expected[0])
 check(jax.jit(with_faces)(sharded, jnp.asarray(PAIR.faces)), expected[0])
-check(classify_vertices(sharded, PAIR.faces).label, classify_vertices(batch, PAIR.faces).label)
+check(classify_vertices(sharded, PAIR.faces).labels, classify_vertices(batch, PAIR.faces).labels)
 # No device gathers what the others have.
 assert "all-gather" not in both.lower(sharded).compile().as_text()
 print("end")

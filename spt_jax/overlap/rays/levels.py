@@ -40,8 +40,8 @@ class Overlaps:
         around: the triangles that open and close the solid around it, outside which it has one
             level less; -1 for an interval inside out, which has none.
         barycentric: of the two points where the ray crosses `ends`.
-        outer: w_out at both ends, which is the interval's level less one; its sign is their class,
-            +1 on V_out and -1 on V_in.
+        outer: w_out at both ends, which is the interval's level less one; its sign is their label,
+            +1 penetrating and -1 inverted.
         length: from end to end. The interval counts |w_out| times.
     """
 

@@ -1,4 +1,4 @@
-"""Which vertices lie in self-intersection: V_0, V_out and V_in of the paper's Algorithm 1."""
+"""Which vertices lie in self-intersection: the paper's V_0, V_out and V_in (Algorithm 1)."""
 
 from typing import Any, NamedTuple
 
@@ -21,48 +21,49 @@ from spt_jax.device.settings import Xla
 from spt_jax.exclusions import as_exclusions
 from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.overlap.labels import CLEAR, INSIDE, OUT
+from spt_jax.overlap.labels import CLEAR, INVERTED, PENETRATING
 from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
 from spt_jax.rest_surface import RestSurface
 
 
-class VertexClasses(eqx.Module):
-    """The class of every vertex, and what follows from it.
+class VertexLabels(eqx.Module):
+    """Whether each vertex penetrates another part, is inverted, or is clear.
 
     Attributes:
-        label: 0 on V_0 (not in self-intersection), +1 on V_out (within another part of the
-            surface), -1 on V_in (where the surface is inside out).
+        labels: +1 where a vertex is `penetrating`, that is inside another part of the surface (the
+            paper's V_out); -1 where the surface there is `inverted`, that is inside out (V_in); 0
+            where it is `clear` of self-intersection (V_0).
 
     Example:
         >>> import trimesh
         >>> from spt_jax import classify_vertices
         >>> box = trimesh.creation.box()
         >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.3, 0.2]))
-        >>> classes = classify_vertices(pair.vertices, pair.faces)
-        >>> int(classes.out.sum()), int(classes.inside.sum()), f"{classes.ratio:.3f}"
+        >>> found = classify_vertices(pair.vertices, pair.faces)
+        >>> int(found.penetrating.sum()), int(found.inverted.sum()), f"{found.ratio:.3f}"
         (2, 0, '0.125')
     """
 
-    label: Int8[Array, "*batch V"]
+    labels: Int8[Array, "*batch V"]
 
     @property
-    def out(self) -> Bool[Array, "*batch V"]:
-        """The vertices of V_out."""
-        return self.label == OUT
+    def penetrating(self) -> Bool[Array, "*batch V"]:
+        """Vertices inside another part of the surface (V_out)."""
+        return self.labels == PENETRATING
 
     @property
-    def inside(self) -> Bool[Array, "*batch V"]:
-        """The vertices of V_in."""
-        return self.label == INSIDE
+    def inverted(self) -> Bool[Array, "*batch V"]:
+        """Vertices where the surface is inside out (V_in)."""
+        return self.labels == INVERTED
 
     @property
     def clear(self) -> Bool[Array, "*batch V"]:
-        """The vertices of V_0."""
-        return self.label == CLEAR
+        """Vertices in no self-intersection (V_0)."""
+        return self.labels == CLEAR
 
     @property
     def ratio(self) -> Float[Array, "*batch"]:
-        """The part of the vertices in self-intersection (paper, Eq. 11)."""
+        """The fraction of the vertices in self-intersection (paper, Eq. 11)."""
         return jnp.mean(jnp.where(self.clear, 0.0, 1.0), axis=-1)
 
 
@@ -77,22 +78,25 @@ def classify_vertices(
     ignore_groups: Any = (),
     folds: RestSurface | None = None,
     backend: str | Xla = "auto",
-) -> VertexClasses:
-    """Sort the vertices into V_0, V_out and V_in (paper, section 3.2).
+) -> VertexLabels:
+    """Label each vertex as penetrating, inverted or clear (paper, section 3.2).
 
-    A vertex's class is the sign of the winding number w_out just outside the surface there: 0 on
-    V_0, more on V_out, less on V_in, for any depth of overlap, where the counters of the paper's
-    Algorithm 1 stop at two.
+    The label is the sign of the winding number w_out just outside the surface at the vertex: zero
+    on clear vertices (the paper's V_0), positive on penetrating ones (V_out), negative on inverted
+    ones (V_in). This holds at any depth of overlap, whereas the counters of the paper's Algorithm 1
+    stop at two.
 
-    The vertex rule finds w_out at the vertex itself, exactly, by following it along the surface
-    from one place of each connected part. Sheets that touch do not overlap: on another sheet, but
-    for rounding, a vertex takes the number nearest to 0. At a vertex whose own triangles pass
-    through one another it is the number on most of its edges.
+    The vertex rule computes w_out at the vertex itself, exactly, by propagating it along the
+    surface from one point of each connected part. Surfaces that touch do not overlap: a vertex
+    that lies on another part of the surface, up to rounding, takes the winding number nearest to
+    zero. A vertex whose own triangles intersect each other takes the number found on most of its
+    edges.
 
-    The triangle rule is Algorithm 1's: rays on a lattice give the class of each crossing to the
-    three corners of its triangle; where triangles around a vertex disagree, V_out goes before
-    V_in and both go before V_0. It takes whole triangles at the rim of an overlap, and misses what
-    is between the rays: a vertex that no ray reaches is V_0.
+    The triangle rule is the paper's Algorithm 1: each crossing of a ray on a lattice passes its
+    label to the three corners of its triangle. Where the triangles around a vertex disagree,
+    penetrating takes precedence over inverted, and both over clear. The rule labels whole triangles
+    along an intersection contour and misses what lies between the rays: a vertex that no ray
+    reaches is clear.
 
     Args:
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
@@ -100,16 +104,16 @@ def classify_vertices(
         rays: for the triangle rule: "auto", no rays at all, every triangle that lies in an overlap
             anywhere; rays along the longer side of the screen; or (rows, columns). The vertex rule
             does not use it.
-        directions: 1, 3 or the rows of a D x 3 array: for the triangle rule, by which a class seen
-            from any of them counts.
+        directions: 1, 3 or the rows of a D x 3 array: for the triangle rule, which takes a label
+            seen along any of them.
         rule: "vertex" or "triangle", as above.
         face_groups, ignore_groups, folds: overlaps that do not count, as in
-            `self_intersection_penalty`; their vertices are V_0. Those of an overlap that counts in
-            part are not.
+            `self_intersection_penalty`; their vertices are clear. Those of an overlap that counts
+            in part are not.
         backend: as in `self_intersection_penalty`.
 
     Returns:
-        The classes; all V_0 where the penalty is NaN.
+        The labels; every vertex is clear where the penalty is NaN.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`.
@@ -122,10 +126,10 @@ def classify_vertices(
         >>> box = trimesh.creation.box()
         >>> inner = box.copy().apply_scale(0.5)
         >>> both = trimesh.util.concatenate(box, inner)
-        >>> classes = classify_vertices(jnp.asarray(both.vertices, "float32"), both.faces)
-        >>> print(classes.label)
+        >>> found = classify_vertices(jnp.asarray(both.vertices, "float32"), both.faces)
+        >>> print(found.labels)
         [0 0 0 0 0 0 0 0 1 1 1 1 1 1 1 1]
-        >>> print(classes.ratio)
+        >>> print(found.ratio)
         0.5
     """
     vertices = as_vertices(vertices)
@@ -137,12 +141,12 @@ def classify_vertices(
     if device is not None:
         program = Program(device, sampling.rays, rule=rule)
         task = as_task(program, sampling, vertices.dtype, exclusions)
-        return VertexClasses(_on_device(program, vertices, jnp.asarray(faces), task.tables))
+        return VertexLabels(_on_device(program, vertices, jnp.asarray(faces), task.tables))
     rounding = float(np.finfo(vertices.dtype).eps)
     options = _Options(rule, sampling, exclusions, rounding)
     results = ((vertices.shape[-2:-1], "int8"),)
     (label,) = call_on_host(_labels_on_host, options, results, vertices, faces)
-    return VertexClasses(label)
+    return VertexLabels(label)
 
 
 class _Options(NamedTuple):

@@ -18,7 +18,7 @@ from helpers import (
     winding_number,
 )
 
-from spt_jax import VertexClasses, classify_vertices
+from spt_jax import VertexLabels, classify_vertices
 from spt_jax.overlap.labels import triangle_labels
 from spt_jax.overlap.measure import measure
 from spt_jax.overlap.rays.levels import Overlaps
@@ -119,17 +119,17 @@ def test_body_against_the_exact_winding_number():
 def test_batches_and_masks(dtype, shape, rule):
     vertices, faces = join(box(), box((0.5, 0.5, 0.5)))
     batch = jnp.broadcast_to(jnp.asarray(vertices, dtype), (*shape, *vertices.shape))
-    for classes in (
+    for found in (
         classify_vertices(batch, faces, rays=64, rule=rule),
         jax.jit(lambda v: classify_vertices(v, faces, rays=64, rule=rule))(batch),
     ):
-        assert isinstance(classes, VertexClasses)
-        assert classes.label.dtype == jnp.int8 and classes.label.shape == batch.shape[:-1]
-        assert classes.ratio.shape == shape
-        np.testing.assert_array_equal(classes.ratio, 0.5)
-        np.testing.assert_array_equal(classes.out, classes.label == 1)
-        assert not classes.inside.any()
-        np.testing.assert_array_equal(classes.clear, ~classes.out)
+        assert isinstance(found, VertexLabels)
+        assert found.labels.dtype == jnp.int8 and found.labels.shape == batch.shape[:-1]
+        assert found.ratio.shape == shape
+        np.testing.assert_array_equal(found.ratio, 0.5)
+        np.testing.assert_array_equal(found.penetrating, found.labels == 1)
+        assert not found.inverted.any()
+        np.testing.assert_array_equal(found.clear, ~found.penetrating)
 
 
 def test_the_vertex_rule_is_the_default_and_is_exact_at_the_rim():
@@ -137,27 +137,27 @@ def test_the_vertex_rule_is_the_default_and_is_exact_at_the_rim():
     vertices, faces = join(box(), box((0.5, 0.5, 0.5), (0.5, 0.01, 0.02)))
     vertices = jnp.asarray(vertices, "float32")
     inner = np.arange(8, 16)[np.asarray(vertices[8:, 0]) < 0.5]
-    label = classify_vertices(vertices, faces).label
+    label = classify_vertices(vertices, faces).labels
     np.testing.assert_array_equal(np.flatnonzero(label), inner)
     np.testing.assert_array_equal(label[inner], 1)
-    np.testing.assert_array_equal(classify_vertices(vertices, faces, rays=1).label, label)
-    whole = classify_vertices(vertices, faces, rule="triangle").out
+    np.testing.assert_array_equal(classify_vertices(vertices, faces, rays=1).labels, label)
+    whole = classify_vertices(vertices, faces, rule="triangle").penetrating
     assert whole[inner].all() and whole.sum() > len(inner)
 
 
 @pytest.mark.parametrize("rule", ["vertex", "triangle"])
 def test_w_out_below_zero_is_inside(rule):
     vertices, faces = join(inverted(box()), box(center=(3, 0, 0)))
-    classes = classify_vertices(jnp.asarray(vertices, "float32"), faces, rays=64, rule=rule)
-    np.testing.assert_array_equal(classes.label, [-1] * 8 + [0] * 8)
-    np.testing.assert_array_equal(classes.inside, classes.label == -1)
+    found = classify_vertices(jnp.asarray(vertices, "float32"), faces, rays=64, rule=rule)
+    np.testing.assert_array_equal(found.labels, [-1] * 8 + [0] * 8)
+    np.testing.assert_array_equal(found.inverted, found.labels == -1)
 
 
 @pytest.mark.parametrize("rule", ["vertex", "triangle"])
 def test_classes_of_unusable_vertices_are_clear(rule):
     vertices, faces = join(box(), box((0.5, 0.5, 0.5)))
     vertices[3, 1] = np.nan
-    label = classify_vertices(jnp.asarray(vertices, "float32"), faces, rule=rule).label
+    label = classify_vertices(jnp.asarray(vertices, "float32"), faces, rule=rule).labels
     np.testing.assert_array_equal(label, 0)
 
 
