@@ -14,7 +14,7 @@ import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap, self_intersection_penalty
-from spt_jax.device.settings import AUTO_RAYS, Xla, bytes_needed, room
+from spt_jax.device.settings import DEFAULT_RAYS, Xla, bytes_needed, room
 
 # Overlaps smaller than this, in m^3, are left out where differences are parts of the volume.
 _LEAST = 1e-6
@@ -64,12 +64,12 @@ def agreement(settings: Settings) -> Table:
     body, mocap = load_body(), load_mocap()
     frames = np.linspace(0, len(mocap.names) - 1, settings.frames).astype(int)
     meshes = body(body.pose_from_smpl(jnp.asarray(mocap.pose[frames]))).vertices
-    rays = {"rays": AUTO_RAYS}
-    folds = {"folds": body.rest_surface, "rays": AUTO_RAYS}
+    rays = {"rays": DEFAULT_RAYS}
+    folds = {"folds": body.rest_surface, "rays": DEFAULT_RAYS}
     kinds = {
-        f"{AUTO_RAYS} rays, both": (rays, rays),
-        f"exact on the host, {AUTO_RAYS} rays here": ({}, {}),
-        f"folds left out, {AUTO_RAYS} rays, both": (folds, folds),
+        f"{DEFAULT_RAYS} rays, both": (rays, rays),
+        f"exact on the host, {DEFAULT_RAYS} rays here": ({}, {}),
+        f"folds left out, {DEFAULT_RAYS} rays, both": (folds, folds),
     }
     rows = []
     with progress() as bar:
@@ -110,7 +110,7 @@ def price(settings: Settings) -> Table:
             taken.append(1e3 * (time.perf_counter() - start))
         return float(np.median(taken))
 
-    space = room(Xla(), AUTO_RAYS)
+    space = room(Xla(), DEFAULT_RAYS)
     bound = bytes_needed(space, len(batch[0]), len(body.faces), 4)
     rows = [
         ("one body, ms", f"{milliseconds(one, batch[0]):.1f}"),
@@ -126,7 +126,7 @@ def price(settings: Settings) -> Table:
     ]
     where = jax.devices()[0]
     return Table(
-        f"Value and gradient of the embedded body with {AUTO_RAYS} rays in three directions on "
+        f"Value and gradient of the embedded body with {DEFAULT_RAYS} rays in three directions on "
         f"{where.platform} ({where.device_kind}), float32",
         ("", ""),
         rows,

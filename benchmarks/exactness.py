@@ -99,7 +99,7 @@ def intersecting_frames(bodies: Bodies, count: int, seed: int) -> list[int]:
 
 def exactly(mesh: Mesh) -> Measurement:
     """The measurement that is the default."""
-    return measure(*mesh, Sampling("auto", as_directions(3)))
+    return measure(*mesh, Sampling(None, as_directions(3)))
 
 
 def gradient_error(
@@ -121,7 +121,7 @@ def bodies_table(settings: Settings, bar) -> list[Table]:
     for frame in bar.track(frames, description="bodies"):
         vertices, velocities = bodies.vertices(frame), bodies.velocities(frame, settings.seed)
         truth: Reference = exact(vertices, bodies.faces)
-        for name, rays in (("default", "auto"), (f"rays={RAYS}", RAYS)):
+        for name, rays in (("default", None), (f"rays={RAYS}", RAYS)):
             found = measure(vertices, bodies.faces, Sampling(rays, as_directions(3)))
             volume = abs(found.volume - truth.volume) / truth.volume
             pull = found.gradient("boundary", "vertex")

@@ -149,7 +149,7 @@ def _options(rng: np.random.Generator, traced_faces: bool) -> dict[str, Any]:
         "value": ("volume", "ratio")[rng.integers(2)],
         "gradient": ("boundary", "vertex", "unit")[rng.integers(3)],
         "rule": ("vertex", "triangle")[rng.integers(2)],
-        "rays": ("auto", 16, (8, 12))[rng.integers(3)],
+        "rays": (None, 16, (8, 12))[rng.integers(3)],
         "directions": (1, 3, rng.normal(size=(2, 3)))[rng.integers(3)],
         "margin": float(rng.uniform(0, 0.1)),
     }

@@ -24,7 +24,7 @@ KINDS = ("general position", "contact", "coplanar", "duplicated", "sliver", "nes
 # Overlaps thinner than a contact, eight units in the last place, may be left out.
 _OFF = {"float32": 3e-5, "float64": 1e-10}
 _LAW = 1e-9
-_SAMPLING = Sampling("auto", as_directions(3))
+_SAMPLING = Sampling(None, as_directions(3))
 
 
 @dataclass(frozen=True)

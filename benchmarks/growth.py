@@ -47,7 +47,7 @@ def cost(vertices, faces, rays, directions, repeats) -> float:
 
 def peak_megabytes(vertices, faces) -> float:
     """The most memory that one call holds beyond its input, as Python's allocators see it."""
-    measured = Sampling(as_rays("auto"), as_directions(3))
+    measured = Sampling(None, as_directions(3))
     tracemalloc.start()
     found = measure(vertices, faces, measured)
     _ = found.volume, found.gradient("boundary", "vertex")
@@ -71,7 +71,7 @@ def measure_growth(repeats: int) -> Growth:
                 (np.asarray(scene.vertices, np.float64), np.asarray(scene.faces, np.int64))
                 for scene in (join_bodies(v[:count], body.faces) for v in (clear, near))
             )
-            ours = [cost(*mesh, "auto", 3, repeats) for mesh in (apart, together)]
+            ours = [cost(*mesh, None, 3, repeats) for mesh in (apart, together)]
             ours.append(cost(*apart, 512, 1, repeats))
             people.append((count, *ours, PAPER_BODIES[count]))
             bar.advance(task)
@@ -83,9 +83,9 @@ def measure_growth(repeats: int) -> Growth:
         sizes = []
         for subdivisions in SUBDIVISIONS:
             mesh = two_balls(subdivisions)
-            sizes.append((len(mesh[1]), cost(*mesh, "auto", 3, repeats), peak_megabytes(*mesh)))
+            sizes.append((len(mesh[1]), cost(*mesh, None, 3, repeats), peak_megabytes(*mesh)))
             bar.advance(task)
-    first, auto = people[0], cost(*one, "auto", 3, repeats)
+    first, auto = people[0], cost(*one, None, 3, repeats)
     tables = [
         Table(
             "Bodies in one scene (the paper's Table 3, on its machine), milliseconds and times one",

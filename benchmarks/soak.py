@@ -128,7 +128,7 @@ def _new_options(rng: np.random.Generator) -> Iterator[None]:
         count = len(mesh.faces)
         options = {
             "directions": rng.normal(size=(rng.integers(1, 4), 3)),
-            "rays": ("auto", int(rng.integers(8, 64)))[rng.integers(2)],
+            "rays": (None, int(rng.integers(8, 64)))[rng.integers(2)],
             "margin": float(rng.choice([0.0, rng.uniform(0.0, 0.1)])),
             "face_groups": rng.permutation(np.repeat([0, 1], count // 2)),
             "ignore_groups": ((0, 1),),

@@ -198,10 +198,10 @@ def _nothing(vertices, faces, options):
 
 def host_measurement(points, faces):
     """A measurement as the callback asks for it."""
-    from spt_jax.arguments import as_directions, as_rays
+    from spt_jax.arguments import as_directions
     from spt_jax.overlap.measure import Sampling, measure
 
-    return measure(points, faces, Sampling(as_rays("auto"), as_directions(3)))
+    return measure(points, faces, Sampling(None, as_directions(3)))
 
 
 def worse(metrics: list[Metric], baseline: Mapping[str, Mapping[str, Any]]) -> list[str]:

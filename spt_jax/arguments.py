@@ -91,13 +91,13 @@ def check_indices(faces: np.ndarray, num_vertices: int) -> None:
 
 
 def as_rays(rays: Any) -> Rays:
-    """ "auto", a whole number of rays along the longer side, or (rows, columns).
+    """None (exact), a whole number of rays along the longer side, or (rows, columns).
 
     Raises:
         TypeError, ValueError: anything else, or a number out of 1 to 4096.
     """
-    if isinstance(rays, str) and rays == "auto":
-        return "auto"
+    if rays is None:
+        return None
     if isinstance(rays, (tuple, list)) and len(rays) == 2:
         return _as_count(rays[0], rays), _as_count(rays[1], rays)
     return _as_count(rays, rays)
@@ -105,7 +105,7 @@ def as_rays(rays: Any) -> Rays:
 
 def _as_count(side: Any, rays: Any) -> int:
     if not isinstance(side, (int, np.integer)) or isinstance(side, bool):
-        raise TypeError(f'rays must be "auto", a whole number or (rows, columns): got {rays!r}.')
+        raise TypeError(f"rays must be None, a whole number or (rows, columns): got {rays!r}.")
     if side < 1 or side > MOST_RAYS:
         raise ValueError(
             f"rays must be from 1 to {MOST_RAYS} a side: got {rays!r}; 512 is a good start."

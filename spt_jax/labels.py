@@ -23,6 +23,7 @@ from spt_jax.host import call_on_host
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.labels import CLEAR, INVERTED, PENETRATING
 from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
+from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
 
 
@@ -71,7 +72,7 @@ def classify_vertices(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
     faces: Integer[Array, "F 3"] | np.ndarray,
     *,
-    rays: int | tuple[int, int] | str = "auto",
+    rays: Rays = None,
     directions: Any = 3,
     rule: Rule = "vertex",
     face_groups: Integer[Array, "F"] | np.ndarray | None = None,
@@ -101,9 +102,9 @@ def classify_vertices(
     Args:
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
-        rays: for the triangle rule: "auto", no rays at all, every triangle that lies in an overlap
-            anywhere; rays along the longer side of the screen; or (rows, columns). The vertex rule
-            does not use it.
+        rays: for the triangle rule: None casts no rays and takes every triangle that lies in an
+            overlap anywhere; or the number of rays along the longer side of the screen; or
+            (rows, columns). The vertex rule does not use it.
         directions: 1, 3 or the rows of a D x 3 array: for the triangle rule, which takes a label
             seen along any of them.
         rule: "vertex" or "triangle", as above.

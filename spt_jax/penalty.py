@@ -26,6 +26,7 @@ from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host, is_local
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Gradient, Rule, Sampling, Unmeasurable, Value, measure
+from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
 from spt_jax.reverse_only import refuse_forward, with_slope
 
@@ -37,7 +38,7 @@ def self_intersection_penalty(
     value: Value = "volume",
     gradient: Gradient = "boundary",
     rule: Rule = "vertex",
-    rays: int | tuple[int, int] | str = "auto",
+    rays: Rays = None,
     directions: Any = 3,
     margin: float = 0.0,
     face_groups: Integer[Array, "F"] | np.ndarray | None = None,
@@ -67,11 +68,11 @@ def self_intersection_penalty(
             takes each triangle as wholly in or out; "unit", its Eq. 10, of length one at every
             vertex in self-intersection.
         rule: how "ratio", "vertex" and "unit" label the vertices, as in `classify_vertices`.
-        rays: "auto": none. Everything is measured in closed form, to rounding, so the volume is
-            smooth and its gradient exact, however the mesh is turned. (Should the sums of the
-            closed form not close, which no mesh has been seen to do, 512 rays a side take over;
-            `intersection_report` says so.) Or how many rays along the longer side of the screen, or
-            (rows, columns): the paper's way.
+        rays: None computes the volume in closed form, exact to rounding, so that it is smooth and
+            its gradient exact, however the mesh is turned. (Should the sums of the closed form not
+            close, which no mesh has been seen to do, 512 rays a side take over;
+            `intersection_report` says so.) A number of rays along the longer side of the screen, or
+            (rows, columns), samples it as the paper does.
         directions: of the rays, where any are cast: 1 (along -z, the paper's camera), 3 orthogonal
             ones, or the rows of a D x 3 array. With one, "boundary" is the exact derivative of the
             sampled volume; with several, crossings are weighed by how well their direction sees the

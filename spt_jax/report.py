@@ -31,7 +31,8 @@ class IntersectionReport:
         labels: +1 penetrating, -1 inverted, 0 clear, as from `classify_vertices`.
         crossing_pairs: pairs of triangles that intersect and count, and in all; those that only
             touch are none.
-        rays: "auto", rays along the longer side of each screen, or (rows, columns), as asked for.
+        rays: as requested: None (exact), rays along the longer side of each screen, or
+            (rows, columns).
         crossings: of rays with triangles, for each beam; none where no rays were needed.
         open_rays: rays of each beam that met a hole and were left out.
         exact: whether the volume is exact. False with `rays`, and where the exact sums were found
@@ -147,7 +148,7 @@ def intersection_report(
     vertices: Float[Array, "V 3"] | np.ndarray,
     faces: Int[Array, "F 3"] | np.ndarray,
     *,
-    rays: int | tuple[int, int] | str = "auto",
+    rays: Rays = None,
     directions: Any = 3,
     rule: Rule = "vertex",
     face_groups: Int[Array, "F"] | np.ndarray | None = None,

@@ -298,7 +298,7 @@ def no_overlap(vertices, *_, **__):
         volumes=(),
         labels=np.zeros(len(vertices), np.int8),
         crossing_pairs=(0, 3),
-        rays="auto",
+        rays=None,
         crossings=(),
         open_rays=(),
         exact=True,

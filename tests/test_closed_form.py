@@ -30,7 +30,7 @@ from spt_jax.overlap.triangles.closed_form import shares_of
 
 def solved(mesh):
     """The measurement of a mesh, which is always exact."""
-    found = measure(*mesh, sampling("auto"))
+    found = measure(*mesh, sampling(None))
     assert found.exact and not found.beams
     return found
 
@@ -235,7 +235,7 @@ def test_convex_solids_apart_or_touching_are_exactly_free():
         second = moved(second, None, shift)
         second[0][:, axis] += first[0][:, axis].max() - second[0][:, axis].min() + gap
         mesh = join(first, second) if k % 2 else _turned(join(first, second))
-        found = measure(*mesh, sampling("auto"))
+        found = measure(*mesh, sampling(None))
         assert found.volume == 0 and not found.gradient("boundary", "vertex").any(), k
 
 
@@ -514,7 +514,7 @@ def test_sums_that_do_not_close_are_noticed():
 def test_what_does_not_close_is_measured_by_rays(monkeypatch):
     mesh = _turned(PAIR)
     volume, pull = solved(mesh).volume, slope(mesh)
-    found = measure(*mesh, sampling("auto"))
+    found = measure(*mesh, sampling(None))
     monkeypatch.setattr(type(found.overlap), "sound", False)
     assert not found.exact and len(found.beams) == 3
     assert found.volume == pytest.approx(volume, rel=1e-3)

@@ -42,12 +42,12 @@ NAMES = [
 ]
 PARAMETERS = {
     "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
-    " rule='vertex', rays='auto', directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
+    " rule='vertex', rays=None, directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
     " folds=None, backend='auto'",
     "paper_penalty": "vertices, faces, *, rays=512, normalize=True, backend='auto'",
-    "classify_vertices": "vertices, faces, *, rays='auto', directions=3, rule='vertex',"
+    "classify_vertices": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), folds=None, backend='auto'",
-    "intersection_report": "vertices, faces, *, rays='auto', directions=3, rule='vertex',"
+    "intersection_report": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), folds=None",
     "check_mesh": "vertices, faces",
     "fit_pose": "body, keypoints, camera, *, joints, confidence=None, regulariser='spt', pose=None,"
@@ -63,7 +63,7 @@ PARAMETERS = {
     "load_mocap": "",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"
-    " rays='auto', directions=3, weights=(0.01, 0.1, 1.0, 10.0, 100.0), steps_per_weight=25,"
+    " rays=None, directions=3, weights=(0.01, 0.1, 1.0, 10.0, 100.0), steps_per_weight=25,"
     " tolerance=1e-09, solver=None, on_step=None",
 }
 # Their docstrings say what there is to say without a list of results.

@@ -154,7 +154,7 @@ def test_other_settings_inputs_and_damage(command, tmp_path, capsys):
 def test_an_input_that_changed_is_named(tmp_path):
     body = embedded_body()
     made = [("a", [np.zeros(3), None, "x", (4, 5)]), ("b", [np.ones(3)])]
-    manifest = manifest_of("fit", {"rays": "auto"}, body, made)
+    manifest = manifest_of("fit", {"rays": None}, body, made)
     say = []
     with UnfinishedRun(tmp_path, manifest, say=say.append) as run:
         run.keep(0, {"x": np.arange(3)})
@@ -168,14 +168,14 @@ def test_an_input_that_changed_is_named(tmp_path):
             UnfinishedRun(tmp_path, changed, say=say.append)
 
     moved = [made[0], ("b", [np.nextafter(np.ones(3), 2)])]
-    refused(manifest_of("fit", {"rays": "auto"}, body, moved), "items 1 made from is '")
-    refused(manifest_of("fit", {"rays": "auto"}, body, made[:1]), "there are 2 items and not 1")
-    refused(manifest_of("fit", {"rays": 64}, body, made), "settings rays is 'auto' and not 64")
-    refused(manifest_of("fit", {}, body, made), "settings rays is 'auto' and not missing")
-    refused(manifest_of("untangle", {"rays": "auto"}, body, made), "command is 'fit' and not 'unt")
+    refused(manifest_of("fit", {"rays": None}, body, moved), "items 1 made from is '")
+    refused(manifest_of("fit", {"rays": None}, body, made[:1]), "there are 2 items and not 1")
+    refused(manifest_of("fit", {"rays": 64}, body, made), "settings rays is None and not 64")
+    refused(manifest_of("fit", {}, body, made), "settings rays is None and not missing")
+    refused(manifest_of("untangle", {"rays": None}, body, made), "command is 'fit' and not 'unt")
     refused(manifest | {"versions": {}}, "versions python is .* and not missing")
     other = jax.tree.map(lambda leaf: leaf + 1, body)
-    refused(manifest_of("fit", {"rays": "auto"}, other, made), "body is '.*' and not '")
+    refused(manifest_of("fit", {"rays": None}, other, made), "body is '.*' and not '")
     (tmp_path / "unfinished" / "manifest.json").write_text("{")
     refused(manifest, "manifest must be JSON: got .*manifest.json")
     (tmp_path / "unfinished" / "manifest.json").unlink()

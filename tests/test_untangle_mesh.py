@@ -155,7 +155,7 @@ def assert_no_worse(vertices, faces, result):
     """The figures, measured anew, and nothing worse than it was."""
     rounding = float(np.finfo(vertices.dtype).eps)
     before, after = (
-        measure(np.float64(points), faces, sampling("auto"), rounding=rounding)
+        measure(np.float64(points), faces, sampling(None), rounding=rounding)
         for points in (vertices, result.vertices)
     )
     for found, told in ((before, result.before), (after, result.after)):
@@ -271,7 +271,7 @@ def test_thin_plates_keep_their_sides():
 
 def test_parts_turned_over_or_pushed_inside_are_seen(rng):
     vertices, faces = two_spheres(1.5, 1)
-    search = _Search(Surface(faces, len(vertices)), vertices, sampling("auto"), lambda *_: None)
+    search = _Search(Surface(faces, len(vertices)), vertices, sampling(None), lambda *_: None)
     second = np.arange(len(vertices)) >= len(vertices) // 2
     shift = np.where(second[:, None], [[3.0, 0.0, 0.0]], 0.0)
     apart = search.look(vertices + shift)

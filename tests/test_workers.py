@@ -21,7 +21,7 @@ from spt_jax.penalty import _Options, _value_and_gradient_on_host
 from spt_jax.rest_surface import RestSurface
 
 SCRIPTS = Path(__file__).parent / "scripts"
-OPTIONS = _Options("volume", "boundary", "vertex", sampling("auto"), NOTHING, 1e-7)
+OPTIONS = _Options("volume", "boundary", "vertex", sampling(None), NOTHING, 1e-7)
 
 pytestmark = pytest.mark.skipif(not module.can_start(), reason="no workers on this system")
 

@@ -2,7 +2,7 @@
 
 import json as json_format
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
@@ -18,7 +18,7 @@ from spt_jax.commands.terminal import (
 
 def check(
     mesh: tyro.conf.Positional[Path],
-    rays: int | Literal["auto"] = "auto",
+    rays: int | None = None,
     max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
@@ -31,8 +31,8 @@ def check(
 
     Args:
         mesh: the file, such as body.ply, body.obj, body.stl or body.glb.
-        rays: "auto": measured exactly, without rays; or rays along the longer side of each of three
-            beams.
+        rays: how many rays to cast along the longer side of each of three beams; not given: none,
+            everything is measured exactly.
         max_bytes: what the file and its arrays may take; not given: 1 GiB.
         json: print the report as JSON.
         quiet: print errors alone.
@@ -66,7 +66,7 @@ def check(
 
 
 def _judge(
-    path: Path, rays: int | Literal["auto"], max_bytes: int | None, found: dict[str, Any]
+    path: Path, rays: int | None, max_bytes: int | None, found: dict[str, Any]
 ) -> tuple[int, list[Any]]:
     from dataclasses import asdict
 
@@ -92,7 +92,7 @@ def _judge(
         if report.intersects
         else "[green]it does not self-intersect[/green]"
     )
-    if rays == "auto" and not report.exact:
+    if rays is None and not report.exact:
         found["warning"] = (
             "the exact sums do not close on this mesh, so rays were cast and the volume is as good "
             "as they are; please report the file"

@@ -33,7 +33,7 @@ DEMO_FRAMES = (
     "roll/0088",  # a body rolled up
 )
 
-_RAYS, _DIRECTIONS, _FOLDS = "auto", 3, "remove"
+_RAYS, _DIRECTIONS, _FOLDS = None, 3, "remove"
 _GUTTER = 24  # pixels between the halves of the picture
 
 

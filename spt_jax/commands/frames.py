@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -68,7 +68,7 @@ def untangle_frames(
     body: "BodyModel",
     motion: Motion,
     *,
-    rays: "int | Literal['auto']",
+    rays: int | None,
     directions: int,
     folds: "Folds",
     fold_distance: float | None = None,
@@ -115,7 +115,7 @@ def untangle_frames(
                 folds=folds,
                 fold_distance=fold_distance,
                 # It measures with twice as many as it searches with.
-                rays=rays if rays == "auto" else max(rays // 2, 1),
+                rays=rays if rays is None else max(rays // 2, 1),
                 directions=directions,
                 on_step=on_step,
             )

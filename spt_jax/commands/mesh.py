@@ -3,7 +3,7 @@
 import json as json_format
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -34,7 +34,7 @@ def untangle_mesh_file(
     out: Path,
     *,
     meshes: bool,
-    rays: int | Literal["auto"],
+    rays: int | None,
     max_bytes: int | None = None,
     json: bool,
     quiet: bool,
@@ -63,7 +63,7 @@ def untangle_mesh_file(
             state(f"{path.name}: attempt {attempt + 1}, step {steps}, {pairs} pairs to part")
 
         # Half the rays, as for poses: the last intersections do not hang on them.
-        sampling = {} if rays == "auto" else {"rays": max(rays // 2, 1)}
+        sampling = {} if rays is None else {"rays": max(rays // 2, 1)}
         with measurable(path.name):
             result = untangle_mesh(given, faces, on_step=on_step, **sampling)
         seconds = time.perf_counter() - start
@@ -165,7 +165,7 @@ def _write_coloured(
     before: Float[np.ndarray, "V 3"],
     after: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    rays: int | Literal["auto"],
+    rays: int | None,
 ) -> list[str]:
     from spt_jax.mesh_files import write_mesh
     from spt_jax.report import intersection_report

@@ -27,7 +27,7 @@ def untangle(
     folds: Literal["ignore", "remove", "count"] = "ignore",
     fold_distance: float | None = None,
     meshes: bool = False,
-    rays: int | Literal["auto"] = "auto",
+    rays: int | None = None,
     anew: bool = False,
     max_bytes: int | None = None,
     json: bool = False,
@@ -56,8 +56,8 @@ def untangle(
             is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
             0.04 on fingers.
         meshes: write a .glb of each frame before and after, coloured by label.
-        rays: "auto", or rays along the longer side of each of the three beams; the search uses
-            half as many.
+        rays: how many rays to cast along the longer side of each of three beams; the search uses
+            half as many; not given: none, everything is measured exactly.
         anew: throw away what is done of an unfinished run in the folder.
         max_bytes: how large an input file may be, and its arrays once unpacked; not given: 1 GiB.
         json: print the report as JSON in place of the table.

@@ -15,7 +15,7 @@ the other triangle: `python -m benchmarks.device` prints by how much that matter
 
 What differs:
 
-- Everything is measured by rays; the closed form stays on the host. `rays="auto"` means 512 along
+- Everything is measured by rays; the closed form stays on the host. `rays=None` means 512 along
   the longer side, and overlaps between the rays are not seen. `rule="triangle"` is by rays too.
 - Overlaps are connected where their surfaces are, so that on meshes of few large triangles they run
   into each other. What does not count takes two passes over the rays; `folds` also a table of 50 MB

@@ -7,8 +7,8 @@ import jax
 from spt_jax.device.beam import most_pixels
 from spt_jax.overlap.rays.beam import Rays
 
-# What `rays="auto"` means here.
-AUTO_RAYS = 512
+# What `rays=None` means here.
+DEFAULT_RAYS = 512
 
 # Of memory, for meshes of a batch that are worked on together on an accelerator.
 _MOST_BYTES = 1 << 30
@@ -49,8 +49,8 @@ class Room(NamedTuple):
 
 
 def known(rays: Rays) -> int | tuple[int, int]:
-    """The rays of "auto" too."""
-    return AUTO_RAYS if rays == "auto" else rays
+    """The number of rays, where None was given too."""
+    return DEFAULT_RAYS if rays is None else rays
 
 
 def bytes_needed(space: Room, num_vertices: int, num_faces: int, itemsize: int) -> int:

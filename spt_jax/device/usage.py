@@ -11,13 +11,14 @@ from spt_jax.device.backend import Program, Task, as_task, usage_on_device
 from spt_jax.device.settings import Room, Xla, room
 from spt_jax.device.strips import Usage
 from spt_jax.overlap.measure import Sampling
+from spt_jax.overlap.rays.beam import Rays
 
 
 def device_usage(
     vertices: Float[Array, "*batch V 3"] | np.ndarray,
     faces: Integer[Array, "F 3"] | np.ndarray,
     *,
-    rays: int | tuple[int, int] | str = "auto",
+    rays: Rays = None,
     directions: Any = 3,
     settings: Xla | None = None,
 ) -> tuple[Usage, Room]:

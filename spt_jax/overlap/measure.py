@@ -38,7 +38,7 @@ class Unmeasurable(ValueError):
 
 
 class Sampling(NamedTuple):
-    """How a mesh is measured: "auto", exactly, or by rays, and the directions of the beams."""
+    """How a mesh is measured: exactly (`rays=None`) or by rays, and the directions of the beams."""
 
     rays: Rays
     directions: Directions
@@ -118,7 +118,7 @@ class Measurement:
     @property
     def exact(self) -> bool:
         """Whether the volume is exact: no rays were asked for, and all exact sums close."""
-        return self.sampling.rays == "auto" and self.overlap.sound
+        return self.sampling.rays is None and self.overlap.sound
 
     @cached_property
     def beams(self) -> list[Probe]:
@@ -137,7 +137,7 @@ class Measurement:
         return found
 
     def _along(self, direction: tuple[float, float, float]) -> Probe:
-        rays = self.sampling.rays if self.sampling.rays != "auto" else _FALLBACK_RAYS
+        rays = self.sampling.rays if self.sampling.rays is not None else _FALLBACK_RAYS
         beam, points = aim(self.vertices, np.array(direction), rays)
         crossings = cast(beam, points, self.faces, simple_rays=False)
         overlaps = find_overlaps(beam, points, self.faces, crossings)
@@ -235,7 +235,7 @@ def measure(
     if reason is not None:
         raise Unmeasurable(reason)
     found = Measurement(vertices, faces, sampling, exclusions, rounding)
-    if sampling.rays == "auto" or exclusions.any:
+    if sampling.rays is None or exclusions.any:
         _ = found.surface  # rays alone need none
     return found
 

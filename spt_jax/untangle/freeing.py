@@ -67,7 +67,7 @@ _TOUCHING = 8.0 * float(np.finfo(np.float64).eps)
 # Of a volume, in rounding.
 _EQUAL = 1e-9
 
-_EXACT = Sampling("auto", ((0.0, 0.0, -1.0),))
+_EXACT = Sampling(None, ((0.0, 0.0, -1.0),))
 
 OnStep = Callable[[int, int, int], None]
 
@@ -293,7 +293,7 @@ class _Search:
 
     def push(self, place: Place) -> Float[np.ndarray, "V 3"]:
         """The gradient of the overlap volume."""
-        if self.sampling.rays == "auto":
+        if self.sampling.rays is None:
             return place.found.overlap.gradient()
         found = measure(place.vertices, self.surface.faces, self.sampling)
         return found.gradient("boundary", "vertex")

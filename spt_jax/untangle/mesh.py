@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from spt_jax.arguments import as_directions, as_rays
 from spt_jax.mesh_check import check_mesh, one_mesh
 from spt_jax.overlap.measure import Sampling
+from spt_jax.overlap.rays.beam import Rays
 from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.freeing import Freed, Place, free_vertices
 from spt_jax.untangle.results import RESULTS, in_words
@@ -102,7 +103,7 @@ def untangle_mesh(
     vertices: Float[Array, "V 3"] | np.ndarray,
     faces: Int[Array, "F 3"] | np.ndarray,
     *,
-    rays: int | tuple[int, int] | str = "auto",
+    rays: Rays = None,
     directions: Any = 3,
     attempts: int = 4,
     steps_per_attempt: int = 40,

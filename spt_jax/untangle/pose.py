@@ -103,7 +103,7 @@ def untangle_pose(
     folds: Folds = "ignore",
     fold_distance: float | None = None,
     margin: float = 0.002,
-    rays: int | str = "auto",
+    rays: int | None = None,
     directions: int | Float[np.ndarray, "D 3"] = 3,
     weights: tuple[float, ...] = _WEIGHTS,
     steps_per_weight: int = 25,
@@ -244,7 +244,7 @@ class _Search(eqx.Module):
     @property
     def measured_rays(self) -> Rays:
         """What is compared and reported is measured with."""
-        return 2 * self.rays if isinstance(self.rays, int) else "auto"
+        return 2 * self.rays if isinstance(self.rays, int) else None
 
     def measure(self, vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Overlap:
         """The overlap of a posed body.
@@ -292,7 +292,7 @@ def _as_search_rays(rays: Any) -> Rays:
         isinstance(search_rays, int) and 2 * search_rays > MOST_RAYS
     ):
         raise ValueError(
-            f'rays must be "auto" or a whole number up to {MOST_RAYS // 2}, half of what is '
+            f"rays must be None or a whole number up to {MOST_RAYS // 2}, half of what is "
             f"measured with: got {rays!r}."
         )
     return search_rays
@@ -338,7 +338,7 @@ def _untangle_one(
                 break
     free = search.is_free(after)
     if surface is not None and int(after.total_crossings):
-        sampling = Sampling("auto", search.directions)
+        sampling = Sampling(None, search.directions)
         skin = untangle_checked(np.asarray(vertices), surface, sampling)
         if skin.moved:
             vertices = jnp.asarray(skin.vertices)

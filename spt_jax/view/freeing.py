@@ -160,7 +160,7 @@ def _free_vertices(scene: Scene, show: Show, stopped: Callable[[], bool]) -> Non
     # where a long one passes; the first that frees the mesh has found what the long one finds.
     vertices = scene.vertices
     surface = Surface(scene.faces, len(vertices))
-    sampling = Sampling("auto", as_directions(3))
+    sampling = Sampling(None, as_directions(3))
 
     def on_step(attempt: int, steps: int, pairs: int) -> None:
         if stopped():

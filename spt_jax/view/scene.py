@@ -17,7 +17,7 @@ from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.overlap.labels import LabelCounts, count_labels
 from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
 
-_EXACT = Sampling("auto", as_directions(3))
+_EXACT = Sampling(None, as_directions(3))
 # The paper's own settings, `paper_penalty`: 512 rays along -z.
 _PAPER = Sampling(512, as_directions(1))
 

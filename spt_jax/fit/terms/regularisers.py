@@ -20,6 +20,7 @@ from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
 from spt_jax.fit.terms.spheres import BodySpheres, sphere_penalty
 from spt_jax.geometry import inflate
 from spt_jax.groups import join_bodies
+from spt_jax.overlap.rays.beam import Rays
 from spt_jax.penalty import self_intersection_penalty
 from spt_jax.rest_surface import RestSurface
 
@@ -142,7 +143,7 @@ class SelfIntersection(Regulariser):
     value: Literal["volume", "ratio"] = eqx.field(static=True, default="volume")
     gradient: Literal["boundary", "vertex", "unit"] = eqx.field(static=True, default="boundary")
     rule: Literal["vertex", "triangle"] = eqx.field(static=True, default="vertex")
-    rays: Any = eqx.field(static=True, default="auto", converter=as_rays)
+    rays: Rays = eqx.field(static=True, default=None, converter=as_rays)
     directions: Any = eqx.field(static=True, default=3, converter=as_directions)
     rest: RestSurface | None = eqx.field(static=True, default=None)
 

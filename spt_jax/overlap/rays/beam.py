@@ -1,12 +1,11 @@
 """Where the detection rays go: directions, screens and the lattice that they are snapped to."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
-Rays = int | tuple[int, int] | Literal["auto"]
+Rays = int | tuple[int, int] | None
 
 # Pixel sizes come from this many steps per factor of two. Coarse enough that a mesh which moves
 # a little keeps its pixel, fine enough that `rays` means what it says to within 9 %.
