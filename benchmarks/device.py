@@ -65,7 +65,7 @@ def agreement(settings: Settings) -> Table:
     frames = np.linspace(0, len(mocap.names) - 1, settings.frames).astype(int)
     meshes = body(body.pose_from_smpl(jnp.asarray(mocap.pose[frames]))).vertices
     rays = {"rays": DEFAULT_RAYS}
-    folds = {"folds": body.rest_surface, "rays": DEFAULT_RAYS}
+    folds = {"rest_surface": body.rest_surface, "rays": DEFAULT_RAYS}
     kinds = {
         f"{DEFAULT_RAYS} rays, both": (rays, rays),
         f"exact on the host, {DEFAULT_RAYS} rays here": ({}, {}),

@@ -89,7 +89,7 @@ def penalties(body):
 
     def both(pose):
         vertices = body(pose).vertices
-        collision = self_intersection_penalty(vertices, body.faces, folds=body.rest_surface)
+        collision = self_intersection_penalty(vertices, body.faces, rest_surface=body.rest_surface)
         return vertices, collision, self_intersection_penalty(vertices, body.faces)
 
     return jax.jit(both)

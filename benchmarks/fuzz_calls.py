@@ -139,7 +139,8 @@ def check(seed: int, number: int) -> tuple[str, str, list[str]]:
         faults = [f"{type(error).__name__}: {str(error)[:200]}"]
     finally:
         jax.config.update("jax_enable_x64", before)
-    shown = {key: value for key, value in options.items() if key not in ("face_groups", "folds")}
+    long = ("face_groups", "rest_surface")
+    shown = {key: value for key, value in options.items() if key not in long}
     return name, dtype, [f"{fault}; options {shown}" for fault in faults]
 
 
@@ -158,10 +159,10 @@ def _options(rng: np.random.Generator, traced_faces: bool) -> dict[str, Any]:
         options["face_groups"] = _GROUPS
         options["ignore_groups"] = (((0, 0), (1, 1)), ((0, 1),))[rng.integers(2)]
     if not traced_faces and rng.integers(3) == 0:
-        options["folds"] = RestSurface(_REST, _FACES, distance=0.3)
+        options["rest_surface"] = RestSurface(_REST, _FACES, distance=0.3)
     if rng.integers(4) == 0:  # by fewer rays than it casts by default, which only cost time here
-        options |= {"backend": "xla", "rays": options.get("rays", "auto")}
-        options["rays"] = 24 if options["rays"] == "auto" else options["rays"]
+        options |= {"backend": "xla", "rays": options.get("rays")}
+        options["rays"] = 24 if options["rays"] is None else options["rays"]
     return options
 
 

@@ -131,8 +131,8 @@ def _ratios():
     rest = body.rest_surface
     return jax.jit(
         lambda vertices: tuple(
-            100 * classify_vertices(vertices, body.faces, folds=folds).ratio
-            for folds in (None, rest)
+            100 * classify_vertices(vertices, body.faces, rest_surface=surface).ratio
+            for surface in (None, rest)
         )
     )
 

@@ -122,7 +122,7 @@ def _vertices(body: BodyModel, scene: Scene):
 def _compiled():
     body = load_body()
     rest = body.rest_surface
-    return jax.jit(lambda v: self_intersection_penalty(v, body.faces, folds=rest))
+    return jax.jit(lambda v: self_intersection_penalty(v, body.faces, rest_surface=rest))
 
 
 def _overlap(vertices):

@@ -165,12 +165,12 @@ stages of at most 20 steps of BFGS with a weight rising to the one shown (RE: th
 none; "paper": gradient descent on the ratio with the unit gradient, 512 x 512 rays, one direction).
 Means with 95 % bootstrap intervals; differences are paired. RE + LR: Wang et al. 2018, RE + SA:
 Pons-Moll et al. 2015 with spheres fitted to the body. "Without folds":
-`classify_vertices(..., folds=body.rest_surface)`. The prior is learned from the other ten motions.
-Of the weights that `--tune` tried on 16 other scenes, with noise, each method has the one with the
-lowest mean error; the rate of "paper" was chosen on 4 of them. These 139 scenes were fitted once
-before, when the search worked in the world's axes and RE + SPT had a last weight of 0.1 with prior
-and limits: its error against RE was then +0.21 mm (-0.97 to +2.03) with exact joints and -1.29
-(-2.37 to -0.46) with noise.
+`classify_vertices(..., rest_surface=body.rest_surface)`. The prior is learned from the other ten
+motions. Of the weights that `--tune` tried on 16 other scenes, with noise, each method has the one
+with the lowest mean error; the rate of "paper" was chosen on 4 of them. These 139 scenes were
+fitted once before, when the search worked in the world's axes and RE + SPT had a last weight of 0.1
+with prior and limits: its error against RE was then +0.21 mm (-0.97 to +2.03) with exact joints and
+-1.29 (-2.37 to -0.46) with noise.
 """
 
 

@@ -146,8 +146,8 @@ def _new_meshes(rng: np.random.Generator) -> Iterator[None]:
         vertices = jax.device_put(np.float32(np.concatenate([mesh.vertices, extra])))
         faces = rng.permutation(mesh.faces)
         rest = RestSurface(np.asarray(vertices), faces, distance=float(rng.uniform(0.01, 0.3)))
-        classify_vertices(vertices, faces, folds=rest)
-        jax.block_until_ready(self_intersection_penalty(vertices, faces, folds=rest))
+        classify_vertices(vertices, faces, rest_surface=rest)
+        jax.block_until_ready(self_intersection_penalty(vertices, faces, rest_surface=rest))
         yield
 
 
@@ -160,7 +160,7 @@ def _poses(rng: np.random.Generator) -> Iterator[None]:
     def step(pose, shape):
         return jax.value_and_grad(
             lambda p: self_intersection_penalty(
-                body(p, shape).vertices, body.faces, folds=body.rest_surface
+                body(p, shape).vertices, body.faces, rest_surface=body.rest_surface
             )
         )(pose)
 

@@ -78,8 +78,8 @@ def main(settings: Settings) -> None:
         time.sleep(1.0)
     kinds = {
         "penalty, default (exact, without rays)": default,
-        "penalty, folds left out": penalty(folds=rest),
-        "penalty, folds left out, margin of 2 mm": penalty(folds=rest, margin=0.002),
+        "penalty, folds left out": penalty(rest_surface=rest),
+        "penalty, folds left out, margin of 2 mm": penalty(rest_surface=rest, margin=0.002),
         "penalty, 512 x 512 rays, three directions": penalty(rays=512),
         "penalty, 512 x 512 rays, one direction": penalty(rays=512, directions=1),
         "penalty, 256 x 256 rays, three directions": penalty(rays=256),

@@ -1,4 +1,4 @@
-"""The arguments that say which overlaps do not count: groups of faces, and folds."""
+"""The arguments that say which overlaps do not count: groups of faces, and a rest surface."""
 
 from typing import Any
 
@@ -9,28 +9,31 @@ from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.rest_surface import RestSurface
 
 
-def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, faces: Any) -> Exclusions:
-    """Which overlaps do not count, hashable.
+def as_exclusions(
+    face_groups: Any, ignore_groups: Any, rest_surface: Any, faces: Any
+) -> Exclusions:
+    """Which overlaps do not count, as a hashable object.
 
     Raises:
-        TypeError: traced groups, groups that are no whole numbers, folds that is no RestSurface.
-        ValueError: groups or folds of other faces; pairs that are no pairs of groups.
+        TypeError: traced groups; groups that are not whole numbers; a rest_surface of another type.
+        ValueError: groups or a rest surface of other faces; pairs that are not pairs of groups.
     """
     num_faces: int = np.shape(faces)[0]
-    if folds is not None and not isinstance(folds, RestSurface):
+    if rest_surface is not None and not isinstance(rest_surface, RestSurface):
         raise TypeError(
-            f"folds must be a RestSurface or None: got {type(folds).__name__}; pass "
+            f"rest_surface must be a RestSurface or None: got {type(rest_surface).__name__}; pass "
             "body.rest_surface, or RestSurface(rest_vertices, faces)."
         )
-    if folds is not None and folds.num_faces != num_faces:
+    if rest_surface is not None and rest_surface.num_faces != num_faces:
         raise ValueError(
-            f"folds must be the rest surface of these faces: got one of {folds.num_faces} faces "
-            f"for {num_faces}; for several bodies in one mesh take folds.copies(count)."
+            f"rest_surface must have these faces: got one of {rest_surface.num_faces} faces for "
+            f"{num_faces}; for several bodies in one mesh pass rest_surface.copies(count)."
         )
-    if folds is not None and not isinstance(faces, Tracer) and not folds.has_faces(faces):
+    known = not isinstance(faces, Tracer)
+    if rest_surface is not None and known and not rest_surface.has_faces(faces):
         raise ValueError(
-            "folds must be the rest surface of these faces: got one of other faces, though of as "
-            "many; make RestSurface(rest_vertices, faces) from the faces that you pass."
+            "rest_surface must have these faces: got as many other faces; make it from the faces "
+            "that you pass, RestSurface(rest_vertices, faces)."
         )
     pairs = _as_pairs(ignore_groups)
     if face_groups is None:
@@ -39,7 +42,7 @@ def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, faces: Any) 
                 f"ignore_groups must come with face_groups: got {ignore_groups!r} alone; pass the "
                 "group of each triangle, such as body.part_groups."
             )
-        return Exclusions(rest=folds)
+        return Exclusions(rest=rest_surface)
     if isinstance(face_groups, Tracer):
         raise TypeError(
             "face_groups must be known when traced: got a traced array; pass a NumPy array."
@@ -60,12 +63,12 @@ def as_exclusions(face_groups: Any, ignore_groups: Any, folds: Any, faces: Any) 
                 f"group {missing[0]}."
             )
     if not pairs:
-        return Exclusions(rest=folds)
-    return Exclusions(groups.astype(np.int64).tobytes(), pairs, folds)
+        return Exclusions(rest=rest_surface)
+    return Exclusions(groups.astype(np.int64).tobytes(), pairs, rest_surface)
 
 
 def as_fold_surface(body: Any, fold_distance: Any) -> RestSurface:
-    """The rest surface that tells a body's folds: its own, or with one distance everywhere.
+    """The rest surface that decides what folds: the body's own, or with one distance everywhere.
 
     Args:
         body: a `BodyModel`.

@@ -77,7 +77,7 @@ def classify_vertices(
     rule: Rule = "vertex",
     face_groups: Integer[Array, "F"] | np.ndarray | None = None,
     ignore_groups: Any = (),
-    folds: RestSurface | None = None,
+    rest_surface: RestSurface | None = None,
     backend: str | Xla = "auto",
 ) -> VertexLabels:
     """Label each vertex as penetrating, inverted or clear (paper, section 3.2).
@@ -108,7 +108,7 @@ def classify_vertices(
         directions: 1, 3 or the rows of a D x 3 array: for the triangle rule, which takes a label
             seen along any of them.
         rule: "vertex" or "triangle", as above.
-        face_groups, ignore_groups, folds: overlaps that do not count, as in
+        face_groups, ignore_groups, rest_surface: overlaps that do not count, as in
             `self_intersection_penalty`; their vertices are clear. Those of an overlap that counts
             in part are not.
         backend: as in `self_intersection_penalty`.
@@ -136,7 +136,7 @@ def classify_vertices(
     vertices = as_vertices(vertices)
     faces = as_faces(faces, vertices.shape[-2])
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    exclusions = as_exclusions(face_groups, ignore_groups, folds, faces)
+    exclusions = as_exclusions(face_groups, ignore_groups, rest_surface, faces)
     rule = as_choice("rule", rule, Rule)
     device = as_backend(backend)
     if device is not None:

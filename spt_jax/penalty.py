@@ -43,7 +43,7 @@ def self_intersection_penalty(
     margin: float = 0.0,
     face_groups: Integer[Array, "F"] | np.ndarray | None = None,
     ignore_groups: Any = (),
-    folds: RestSurface | None = None,
+    rest_surface: RestSurface | None = None,
     backend: str | Xla = "auto",
 ) -> Float[Array, "*batch"]:
     r"""Volume of a closed mesh's self-intersection, as a loss with its own exact gradient.
@@ -86,13 +86,15 @@ def self_intersection_penalty(
         ignore_groups: pairs of groups whose overlaps do not count, such as ((0, 0), (1, 1)) for
             "only between the two people". Between groups that are closed by themselves that is
             exact at any depth: what is within and what is between add up to the whole, to
-            rounding. Groups that are parts of one surface are judged as folds are.
-        folds: the surface at rest (`body.rest_surface`). Where triangles intersect that are nearer
-            to each other along it than what lies there may fold (0.3 m on trunk and limbs, 2 to 4
-            cm on fingers), bending made a fold, which does not count. A connected overlap counts
-            with the share of its intersection contour's length that is no fold: whole for two
-            limbs, not at all for the crease of an elbow. The share is a part of the derivative.
-            Parts that lie in each other at rest, as eyeballs in a head, do not count.
+            rounding. Groups that are parts of one surface are judged by
+            their contours, as folds are.
+        rest_surface: the surface at rest (`body.rest_surface`), to leave out folds. Intersecting
+            triangles that are near each other along it (within 0.3 m on trunk and limbs, 2 to 4 cm
+            on fingers) are a fold of the skin, made by bending. An overlap region counts by the
+            fraction of its intersection contour's length that is not a fold: entirely for two
+            limbs, not at all for the crease of an elbow. The fraction is differentiated too. Parts
+            that are enclosed in each other at rest, as eyeballs in a head, do not count. None:
+            every overlap counts.
         backend: "numpy": on the host; "xla", or `spt_jax.device.settings.Xla` with the sizes of its
             arrays: in JAX alone, where the vertices are; "auto": "numpy", also where JAX runs on a
             GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and tells
@@ -109,10 +111,11 @@ def self_intersection_penalty(
 
     Raises:
         TypeError: vertices not float32 or float64; faces or groups not whole numbers; rays,
-            directions, margin or groups that are no numbers, or are traced; folds no RestSurface.
+            directions, margin or groups that are no numbers, or are traced; a rest_surface of
+            another type.
         ValueError: wrong shapes; a face out of range; rays not positive; directions zero or not
-            finite; a margin that is negative or not finite; groups or folds that do not fit the
-            faces; an unknown option.
+            finite; a margin that is negative or not finite; groups or a rest surface that do not
+            fit the faces; an unknown option.
 
     Differentiation: reverse mode (`jax.grad`, `jax.vjp`, `jac="bwd"` in optimistix) with respect to
         vertices. Forward mode (`jax.jvp`, `jax.jacfwd`, calling what `jax.linearize` returns) is
@@ -145,7 +148,7 @@ def self_intersection_penalty(
         as_choice("gradient", gradient, Gradient),
         as_choice("rule", rule, Rule),
         Sampling(as_rays(rays), as_directions(directions)),
-        as_exclusions(face_groups, ignore_groups, folds, faces),
+        as_exclusions(face_groups, ignore_groups, rest_surface, faces),
         float(np.finfo(vertices.dtype).eps),
     )
     device = as_backend(backend)

@@ -153,7 +153,7 @@ def intersection_report(
     rule: Rule = "vertex",
     face_groups: Int[Array, "F"] | np.ndarray | None = None,
     ignore_groups: Any = (),
-    folds: RestSurface | None = None,
+    rest_surface: RestSurface | None = None,
 ) -> IntersectionReport:
     """What the penalty sees on one mesh: volume, ratio, labels, and how far to trust them.
 
@@ -167,7 +167,8 @@ def intersection_report(
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
         rays, directions: as in `self_intersection_penalty`.
         rule: how the vertices are labelled, as in `classify_vertices`.
-        face_groups, ignore_groups, folds: what does not count, as in `self_intersection_penalty`.
+        face_groups, ignore_groups, rest_surface: what does not count, as in
+            `self_intersection_penalty`.
 
     Returns:
         The report; `print` shows it as a table, `as_dict()` is ready for JSON.
@@ -192,7 +193,7 @@ def intersection_report(
     given, triangles = one_mesh(vertices, faces)
     points, triangles = np.asarray(given, np.float64), triangles.astype(np.int64)
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    exclusions = as_exclusions(face_groups, ignore_groups, folds, triangles)
+    exclusions = as_exclusions(face_groups, ignore_groups, rest_surface, triangles)
     wanted = as_choice("rule", rule, Rule)
     rounding = float(np.finfo(given.dtype).eps)
     found = measure(points, triangles, sampling, exclusions, rounding)

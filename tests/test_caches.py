@@ -58,10 +58,10 @@ def test_new_values_of_every_option_keep_a_bounded_number_of_things(rng):
             directions=rng.normal(size=(3, 3)),
             face_groups=np.roll(np.repeat([0, 1], 12), k),
             ignore_groups=((0, 0),),
-            folds=rest,
+            rest_surface=rest,
             margin=1e-3 * k,
         )
-        classify_vertices(vertices, faces, folds=rest)
+        classify_vertices(vertices, faces, rest_surface=rest)
     gc.collect()
     assert len(kept) <= 16
     recent = host_side._recent

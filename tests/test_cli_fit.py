@@ -249,8 +249,8 @@ def test_what_is_a_fold_reaches_the_fit_and_the_report(
     without_pictures(monkeypatch)
     reports, scenes = [], []
 
-    def report(vertices, *_, folds):
-        reports.append(folds)
+    def report(vertices, *_, rest_surface):
+        reports.append(rest_surface)
         return no_overlap(vertices)
 
     def together(body, keypoints, camera, **options):
@@ -274,7 +274,7 @@ def test_what_is_a_fold_reaches_the_fit_and_the_report(
     usual = load_body().rest_surface
     wanted = usual.within(0.1) if words else usual
     assert scenes == [expected] and reports == [wanted] * 3
-    assert all(call["regulariser"].rest == wanted for call in calls)
+    assert all(call["regulariser"].rest_surface == wanted for call in calls)
     settings = json.loads((out / "report.json").read_text())["settings"]
     assert settings["fold_distance"] == expected
 

@@ -38,18 +38,20 @@ def test_folds_do_not_count():
 
     def ratio(vertices):
         return self_intersection_penalty(
-            vertices, FACES, value="ratio", rays=RAYS, folds=rest, backend="xla"
+            vertices, FACES, value="ratio", rays=RAYS, rest_surface=rest, backend="xla"
         )
 
     values, pullback = jax.vjp(ratio, bodies)
     (gradients,) = pullback(np.ones_like(values))
-    expected = classify_vertices(bodies, FACES, folds=rest, backend="numpy").ratio
+    expected = classify_vertices(bodies, FACES, rest_surface=rest, backend="numpy").ratio
     np.testing.assert_allclose(values, expected, rtol=1e-5)
     assert values[0] > 0 and values[2] > 0
     assert values[1] == 0 and not gradients[1].any()
     for k in (0, 2):
         volume, slope = jax.value_and_grad(
-            lambda v: self_intersection_penalty(v, FACES, rays=RAYS, folds=rest, backend="numpy")
+            lambda v: self_intersection_penalty(
+                v, FACES, rays=RAYS, rest_surface=rest, backend="numpy"
+            )
         )(bodies[k])
         assert volume > 0
         assert np.linalg.norm(gradients[k] - slope) < 1e-3 * np.linalg.norm(slope)

@@ -94,7 +94,7 @@ def test_what_is_enclosed_at_rest_does_not_count():
         vertices, faces = jnp.asarray(turned[0][: 16 * copies], "float32"), turned[1][: 24 * copies]
         return float(
             self_intersection_penalty(
-                vertices, faces, rays=rays, folds=rest.copies(copies), backend=backend
+                vertices, faces, rays=rays, rest_surface=rest.copies(copies), backend=backend
             )
         )
 

@@ -41,8 +41,8 @@ ROW = join(*BALLS)
 GROUPS = np.repeat([4, 0, 9], len(BALLS[0][1]))  # any numbers will do
 
 
-def measured(mesh, folds=None, groups=None, ignored=(), rays=None):
-    exclusions = as_exclusions(groups, ignored, folds, mesh[1])
+def measured(mesh, rest_surface=None, groups=None, ignored=(), rays=None):
+    exclusions = as_exclusions(groups, ignored, rest_surface, mesh[1])
     return measure(*mesh, sampling(rays), exclusions)
 
 
@@ -85,7 +85,7 @@ def test_two_people(x64):
     assert within == pytest.approx(alone, rel=1e-12)
     # Copies of a rest surface fold each by itself; what two people share is never a fold.
     rest = embedded_body().rest_surface
-    folded = measured(mesh, folds=rest.copies(2)).volume
+    folded = measured(mesh, rest_surface=rest.copies(2)).volume
     each = sum(measured((body, body_faces()), rest).volume for body in (first, second))
     assert folded == pytest.approx(between + each, rel=1e-12) and folded < whole
 
@@ -119,22 +119,24 @@ def test_a_far_end_that_touches_counts():
     ring, rest = tube(0.4, 0.3, 0.1, 1.0, 80)
     whole = measured(ring)
     assert whole.volume > 1e-3
-    found = measured(ring, folds=rest)
+    found = measured(ring, rest_surface=rest)
     assert found.volume == whole.volume == found.total_volume
     np.testing.assert_array_equal(found.labels("vertex"), whole.labels("vertex"))
     assert found.crossing_pairs == whole.crossing_pairs
-    assert measured(ring, folds=rest.within(100.0)).volume == 0
+    assert measured(ring, rest_surface=rest.within(100.0)).volume == 0
 
 
 def test_a_fold_does_not_count():
     mesh, rest = knee()  # 0.6 long
     whole = measured(mesh)
     assert whole.volume > 1e-3 and whole.labels("vertex").any()
-    found = measured(mesh, folds=rest.within(1.0))
+    found = measured(mesh, rest_surface=rest.within(1.0))
     assert found.volume == 0 and found.total_volume == pytest.approx(whole.volume, rel=1e-12)
     assert not found.labels("vertex").any() and not found.gradient("boundary", "vertex").any()
     assert found.crossing_pairs == 0 < whole.crossing_pairs
-    assert measured(mesh, folds=rest.within(0.0)).volume == pytest.approx(whole.volume, rel=1e-12)
+    assert measured(mesh, rest_surface=rest.within(0.0)).volume == pytest.approx(
+        whole.volume, rel=1e-12
+    )
 
 
 FRAMES = {"run/0005": False, "crawl/0092": False, "crawl/0012": True, "roll/0056": True}
@@ -144,7 +146,7 @@ FRAMES = {"run/0005": False, "crawl/0092": False, "crawl/0012": True, "roll/0056
 def test_penalty_labels_and_report_agree_on_bodies(frame, x64):
     """Where folds are all there is, nothing counts; elsewhere a part of the overlap."""
     vertices, faces = posed_bodies([frame])[0], body_faces()
-    options = {"folds": embedded_body().rest_surface}
+    options = {"rest_surface": embedded_body().rest_surface}
     report = intersection_report(vertices, faces, **options)
     value = float(self_intersection_penalty(jnp.asarray(vertices), faces, **options))
     label = classify_vertices(jnp.asarray(vertices), faces, **options).labels
@@ -171,7 +173,7 @@ def test_nothing_left_out_is_the_whole(x64):
     for options in (
         {"face_groups": GROUPS},
         {"face_groups": GROUPS, "ignore_groups": ((4, 9),)},
-        {"folds": rest},
+        {"rest_surface": rest},
     ):
         found = jax.value_and_grad(self_intersection_penalty)(vertices, faces, **options)
         assert float(found[0]) == pytest.approx(float(whole[0]), rel=1e-12)
@@ -185,10 +187,10 @@ def differences(run, mesh, velocity, step):
 
 def test_gradient_with_folds_is_the_derivative_in_closed_form():
     rng = np.random.default_rng(1)
-    mesh, folds = tube(0.4, 0.3, 0.1, 1.0, 80)
-    exact = measured(mesh, folds).gradient("boundary", "vertex")
+    mesh, rest = tube(0.4, 0.3, 0.1, 1.0, 80)
+    exact = measured(mesh, rest).gradient("boundary", "vertex")
     velocity = 0.1 * rng.normal(size=exact.shape)
-    numeric = differences(functools.partial(measured, folds=folds), mesh, velocity, 1e-5)
+    numeric = differences(functools.partial(measured, rest_surface=rest), mesh, velocity, 1e-5)
     assert np.sum(exact * velocity) == pytest.approx(
         numeric, abs=1e-6 * np.abs(exact * velocity).sum()
     )
@@ -204,7 +206,7 @@ def test_transformations_with_folds_and_groups(dtype):
 
     def loss(vertices):
         return self_intersection_penalty(
-            vertices, ring[1], folds=rest, face_groups=groups, ignore_groups=()
+            vertices, ring[1], rest_surface=rest, face_groups=groups, ignore_groups=()
         )
 
     values = np.stack([loss(v) for v in batch])
@@ -215,7 +217,7 @@ def test_transformations_with_folds_and_groups(dtype):
     np.testing.assert_allclose(jax.jit(jax.vmap(loss))(batch), values, **close)
     np.testing.assert_allclose(jax.vmap(jax.grad(loss))(batch), slopes, **close)
     np.testing.assert_allclose(jax.jit(jax.grad(lambda b: loss(b).sum()))(batch), slopes, **close)
-    double = [measured((np.float64(v), ring[1]), folds=rest).volume for v in batch]
+    double = [measured((np.float64(v), ring[1]), rest_surface=rest).volume for v in batch]
     np.testing.assert_allclose(values, double, rtol=1e-5 if dtype == np.float32 else 1e-12)
 
 
@@ -223,7 +225,7 @@ def test_equal_options_are_equal():
     vertices = jnp.asarray(ROW[0], "float32")
 
     def call(groups, rest):
-        options = {"face_groups": groups, "ignore_groups": [[0, 4]], "folds": rest}
+        options = {"face_groups": groups, "ignore_groups": [[0, 4]], "rest_surface": rest}
         return self_intersection_penalty(vertices, ROW[1], **options)
 
     rest = RestSurface(*ROW, distance=0.01)
@@ -254,11 +256,11 @@ def test_turning_the_body_turns_no_fold_into_a_collision(rng):
     rest = embedded_body().rest_surface
     for name, collides in (("run/0005", False), ("cartwheel/0103", True)):
         (vertices,) = posed_bodies([name])
-        straight = intersection_report(vertices, body_faces(), folds=rest)
+        straight = intersection_report(vertices, body_faces(), rest_surface=rest)
         assert (straight.volume > 0) == (straight.crossing_pairs[0] > 0) == collides
         for _ in range(3):
             turned = vertices @ random_rotation(rng).T
-            found = intersection_report(turned, body_faces(), folds=rest)
+            found = intersection_report(turned, body_faces(), rest_surface=rest)
             assert found.volume == pytest.approx(straight.volume, rel=1e-9)
             assert found.crossing_pairs == straight.crossing_pairs
 
@@ -266,8 +268,8 @@ def test_turning_the_body_turns_no_fold_into_a_collision(rng):
 def test_the_rest_surface_of_other_faces_is_refused(untyped):
     body = embedded_body()
     vertices, faces = jnp.asarray(body.template, "float32"), np.asarray(body.faces)
-    with pytest.raises(ValueError, match="folds must be the rest surface of these faces"):
-        self_intersection_penalty(vertices, faces[::-1].copy(), folds=body.rest_surface)
+    with pytest.raises(ValueError, match="rest_surface must have these faces"):
+        self_intersection_penalty(vertices, faces[::-1].copy(), rest_surface=body.rest_surface)
     scene = join_bodies(jnp.stack([vertices, vertices + 3.0]), faces)
-    folds = body.rest_surface.copies(2)
-    assert self_intersection_penalty(scene.vertices, scene.faces, folds=folds) == 0
+    rest = body.rest_surface.copies(2)
+    assert self_intersection_penalty(scene.vertices, scene.faces, rest_surface=rest) == 0

@@ -179,7 +179,7 @@ def test_who_was_not_seen_at_all_is_said_under_jit(traced):
 def overlap(found):
     body = embedded_body()
     return [
-        1e6 * intersection_report(vertices, body.faces, folds=body.rest_surface).volume
+        1e6 * intersection_report(vertices, body.faces, rest_surface=body.rest_surface).volume
         for vertices in found.vertices
     ]
 

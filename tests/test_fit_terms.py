@@ -359,7 +359,7 @@ def test_the_penalty_is_the_overlap_in_cubic_centimetres():
     assert volume > 10
     np.testing.assert_allclose(term.energy(body, now, now), volume, rtol=1e-3)
     apart = SelfIntersection().prepared(body, 1)
-    ignoring = 1e6 * self_intersection_penalty(vertices, body.faces, folds=body.rest_surface)
+    ignoring = 1e6 * self_intersection_penalty(vertices, body.faces, rest_surface=body.rest_surface)
     np.testing.assert_allclose(apart.energy(body, now, now), ignoring, rtol=1e-3)
     ratio = SelfIntersection(folds="count", value="ratio", gradient="unit").prepared(body, 1)
     part = self_intersection_penalty(vertices, body.faces, value="ratio", gradient="unit")

@@ -16,7 +16,7 @@ OPTIONS = {
     "default": {},
     "margin": {"margin": 0.1},
     "groups": {"face_groups": np.repeat([0, 1], len(FACES) // 2), "ignore_groups": ((0, 0),)},
-    "folds": {"folds": RestSurface(*PAIR)},
+    "rest_surface": {"rest_surface": RestSurface(*PAIR)},
     "ratio": {"value": "ratio", "rule": "triangle", "gradient": "unit"},
     "rays": {"rays": (20, 30), "directions": 1},
 }
@@ -37,7 +37,7 @@ def test_nan_and_nothing_with_every_option(name):
     value, gradient = jax.value_and_grad(penalty)(apart)
     assert value == 0 and np.abs(gradient).max() == 0
     none = np.zeros((0, 3), np.int32)
-    for name in ("face_groups", "ignore_groups", "folds"):
+    for name in ("face_groups", "ignore_groups", "rest_surface"):
         options = {key: value for key, value in options.items() if key != name}
     for count in (0, 4):
         value, gradient = jax.value_and_grad(penalty)(jnp.ones((count, 3)), none)
@@ -123,9 +123,11 @@ ERRORS = {
     "uneven pairs": (_ignoring(((0, 1), (1,))), ValueError, "must be pairs of group numbers"),
     "pairs a number": (_ignoring(3), ValueError, "must be pairs of group numbers.*got 3"),
     "no such group": (_ignoring(((0, 7),)), ValueError, r"got \(0, 7\), and no face is in group 7"),
-    "folds": (_wrong(folds=object()), TypeError, "folds must be a RestSurface or None: got object"),
-    "folds of another mesh": (
-        _wrong(folds=RestSurface(*box())), ValueError, "got one of 12 faces for 640.*copies"
+    "rest_surface": (
+        _wrong(rest_surface=object()), TypeError, "must be a RestSurface or None: got object"
+    ),
+    "rest_surface of another mesh": (
+        _wrong(rest_surface=RestSurface(*box())), ValueError, "got one of 12 faces for 640.*copies"
     ),
 }  # fmt: skip
 
@@ -146,8 +148,8 @@ def test_labels_and_report_refuse_the_same(function, untyped):
         function(GOOD, FACES, ignore_groups=((0, 1),))
     with pytest.raises(ValueError, match="no face is in group 2"):
         function(GOOD, FACES, face_groups=groups, ignore_groups=((0, 2),))
-    with pytest.raises(TypeError, match="folds must be a RestSurface"):
-        function(GOOD, FACES, folds=True)
+    with pytest.raises(TypeError, match="rest_surface must be a RestSurface"):
+        function(GOOD, FACES, rest_surface=True)
 
 
 def test_traced_groups_are_refused(untyped):

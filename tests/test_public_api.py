@@ -43,12 +43,12 @@ NAMES = [
 PARAMETERS = {
     "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
     " rule='vertex', rays=None, directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
-    " folds=None, backend='auto'",
+    " rest_surface=None, backend='auto'",
     "paper_penalty": "vertices, faces, *, rays=512, normalize=True, backend='auto'",
     "classify_vertices": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
-    " face_groups=None, ignore_groups=(), folds=None, backend='auto'",
+    " face_groups=None, ignore_groups=(), rest_surface=None, backend='auto'",
     "intersection_report": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
-    " face_groups=None, ignore_groups=(), folds=None",
+    " face_groups=None, ignore_groups=(), rest_surface=None",
     "check_mesh": "vertices, faces",
     "fit_pose": "body, keypoints, camera, *, joints, confidence=None, regulariser='spt', pose=None,"
     " shape=None, translation=None, fit_shape=False, fit_translation=True, prior='mocap',"

@@ -97,7 +97,7 @@ def test_a_reading_is_the_report(paper, count_folds):
     report = intersection_report(
         scene.vertices,
         scene.faces,
-        folds=None if count_folds else scene.body.rest_surface,
+        rest_surface=None if count_folds else scene.body.rest_surface,
         **options,
     )
     reading = scene.read()

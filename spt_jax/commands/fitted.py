@@ -75,7 +75,11 @@ def _scaled(camera: Any, scale: float) -> Any:
 
 
 def as_fitted(
-    body: "BodyModel", one: Annotated, result: "FitResult", folds: "RestSurface", seconds: float
+    body: "BodyModel",
+    one: Annotated,
+    result: "FitResult",
+    rest_surface: "RestSurface",
+    seconds: float,
 ) -> Fitted:
     """One person's fit in NumPy, measured; no overlap where there is no body to measure."""
     from spt_jax.overlap.measure import Unmeasurable
@@ -85,7 +89,7 @@ def as_fitted(
     overlap = None
     if np.isfinite(vertices).all():
         with suppress(Unmeasurable):
-            overlap = intersection_report(vertices, body.faces, folds=folds)
+            overlap = intersection_report(vertices, body.faces, rest_surface=rest_surface)
     root = np.asarray(one.camera.to_camera(result.joints[:1]))[0]
     status, reason = int(result.status), result.reason
     if status < 2 and photograph.is_too_wide(one.camera, one.size):

@@ -88,7 +88,7 @@ def untangle_frames(
     from spt_jax.untangle.pose import untangle_pose
 
     rest = as_fold_surface(body, fold_distance) if folds == "ignore" else None
-    asked = {"rays": rays, "directions": directions, "folds": rest}
+    asked = {"rays": rays, "directions": directions, "rest_surface": rest}
     frames = []
     for k, name in enumerate(motion.names):
         state(name, done=k)

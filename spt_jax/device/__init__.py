@@ -18,8 +18,8 @@ What differs:
 - Everything is measured by rays; the closed form stays on the host. `rays=None` means 512 along
   the longer side, and overlaps between the rays are not seen. `rule="triangle"` is by rays too.
 - Overlaps are connected where their surfaces are, so that on meshes of few large triangles they run
-  into each other. What does not count takes two passes over the rays; `folds` also a table of 50 MB
-  for the embedded body, once.
+  into each other. What does not count takes two passes over the rays; `rest_surface` also a table
+  of 50 MB for the embedded body, once.
 - An interval counts or is left out as a whole. Where three solids overlap and one of their pairs is
   left out, which of the other pairs go with it depends on the order in which rays meet them.
 - More than 16,000 parts (at 512 rays) over one another, or a row of the screen with more crossings

@@ -191,7 +191,7 @@ def _penetration(body: BodyModel, fits: FitResult, rest: RestSurface) -> Penetra
                 scene.faces,
                 face_groups=scene.face_groups,
                 ignore_groups=ignored,
-                folds=rest,
+                rest_surface=rest,
             )
         except Unmeasurable:
             nothing, none = jnp.asarray(jnp.nan, jnp.float32), jnp.asarray(-1)

@@ -402,7 +402,7 @@ def _descend(search: _Search, body, fixed, moved, margin, weight):
             body.faces,
             rays=search.rays,
             directions=np.array(search.directions),
-            folds=search.rest,
+            rest_surface=search.rest,
         )
         return jnp.sum(moved**2) + weight * volume / _CENTIMETRE**3
 

@@ -117,6 +117,7 @@ class SelfIntersection(Regulariser):
             `optimistix.GradientDescent`. The ratio is in per cent then, and no gradient of the
             value.
         rays, directions: as in `self_intersection_penalty`.
+        rest_surface: set by `prepared`, for one body or several; decides what is a fold.
 
     Example:
         >>> import jax.numpy as jnp
@@ -145,7 +146,7 @@ class SelfIntersection(Regulariser):
     rule: Literal["vertex", "triangle"] = eqx.field(static=True, default="vertex")
     rays: Rays = eqx.field(static=True, default=None, converter=as_rays)
     directions: Any = eqx.field(static=True, default=3, converter=as_directions)
-    rest: RestSurface | None = eqx.field(static=True, default=None)
+    rest_surface: RestSurface | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         as_choice("folds", self.folds, Literal["ignore", "count"])
@@ -154,11 +155,12 @@ class SelfIntersection(Regulariser):
         as_choice("rule", self.rule, Literal["vertex", "triangle"])
 
     def prepared(self, body: BodyModel, people: int) -> "SelfIntersection":
-        """With the rest surface that folds are told by."""
+        """With the rest surface that decides what is a fold."""
         if self.folds == "count":
             return self
-        rest = as_fold_surface(body, self.fold_distance)
-        return dataclasses.replace(self, rest=rest.copies(people) if people > 1 else rest)
+        surface = as_fold_surface(body, self.fold_distance)
+        surface = surface.copies(people) if people > 1 else surface
+        return dataclasses.replace(self, rest_surface=surface)
 
     def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
         """Overlap of all people with themselves and each other: cm^3, or per cent of vertices."""
@@ -175,7 +177,7 @@ class SelfIntersection(Regulariser):
             rule=self.rule,
             rays=self.rays,
             directions=np.array(self.directions),
-            folds=self.rest,
+            rest_surface=self.rest_surface,
         )
         return found / _CENTIMETRE**3 if self.value == "volume" else found * 100
 
