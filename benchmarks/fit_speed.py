@@ -43,7 +43,7 @@ def measured(settings: Settings) -> list[list[str]]:
             body,
             points[rows],
             camera(),
-            joints="smpl",
+            layout="smpl",
             confidence=seen[rows],
             shape=shapes[rows],
             regulariser=regulariser,

@@ -90,7 +90,7 @@ class Fitter:
             self.body,
             np.stack([scene.exact if exact else scene.noisy for scene in some]),
             camera(),
-            joints="smpl",
+            layout="smpl",
             confidence=None if exact else np.stack([scene.seen for scene in some]),
             shape=np.stack([scene.shape for scene in some]),
             regulariser=self.regulariser(),

@@ -208,7 +208,7 @@ def _fitted(rng: np.random.Generator) -> Iterator[None]:
     while True:
         pose = frames[rng.integers(len(frames))].at[0].set(jnp.array([jnp.pi, 0.0, 0.0]))
         seen = camera.project(body(pose).joints[:22]) + rng.normal(scale=3.0, size=(22, 2))
-        fit_pose(body, seen, camera, joints="smpl")
+        fit_pose(body, seen, camera, layout="smpl")
         yield
 
 

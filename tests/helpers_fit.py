@@ -53,15 +53,15 @@ def body_of(smpl, names):
 
 
 @functools.cache
-def figure(joints="smpl22"):
+def figure(layout="smpl22"):
     with jax.ensure_compile_time_eval():  # also where a test traces
-        return make_figure(embedded_body(), keypoint_regressor(embedded_body(), joints))
+        return make_figure(embedded_body(), keypoint_regressor(embedded_body(), layout))
 
 
 def objective(
     keypoints,
     *,
-    joints="smpl22",
+    layout="smpl22",
     confidence=None,
     pixels=5.0,
     robust=None,
@@ -72,7 +72,7 @@ def objective(
     fit_translation=True,
 ):
     """The objective of one person, terms and all, without `fit_pose`."""
-    body, part = embedded_body(), figure(joints)
+    body, part = embedded_body(), figure(layout)
     keypoints = jnp.asarray(keypoints)
     dtype = keypoints.dtype
     prior = pose_prior(body.joint_names)
@@ -99,9 +99,9 @@ def objective(
     )
 
 
-def seen(pose, joints="smpl22", translation=None, shape=None, by=None):
+def seen(pose, layout="smpl22", translation=None, shape=None, by=None):
     """Keypoints of the embedded body in a pose, as the whole body has them."""
     body = embedded_body()
     posed = body(pose, shape, translation)
     by = camera(pose.dtype) if by is None else by
-    return by.project(keypoint_regressor(body, joints).of(posed))
+    return by.project(keypoint_regressor(body, layout).of(posed))

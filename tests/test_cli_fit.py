@@ -34,8 +34,8 @@ def calls(monkeypatch):
     """The options of every call of a stand-in for fit_pose: bodies at rest, 4 m away."""
     made = []
 
-    def stand_in(body, keypoints, camera, *, joints, confidence, **options):
-        made.append(dict(joints=joints, **options))
+    def stand_in(body, keypoints, camera, *, layout, confidence, **options):
+        made.append(dict(layout=layout, **options))
         where = jnp.array([0.0, 0.0, 4.0])
         flip = jnp.array([1.0, -1.0, -1.0])
         return FitResult(
@@ -339,10 +339,10 @@ def test_keypoints_of_smpl_on_a_body_file(calls, tmp_path, rng, monkeypatch, cap
     np.savez(tmp_path / "a.npz", keypoints=rng.uniform(50, 200, (24, 2)))
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps([[500, 0, 100, 0], [0, 400, 90, 0], [0, 0, 1, 0]]))
-    words = ["fit", str(tmp_path / "a.npz"), "--out", str(tmp_path / "out"), "--joints", "smpl24"]
+    words = ["fit", str(tmp_path / "a.npz"), "--out", str(tmp_path / "out"), "--layout", "smpl24"]
     words += ["--body", str(tmp_path / "model.npz"), "--camera", str(camera)]
     assert main(words) == 0
-    assert calls[0]["joints"] == "smpl24"
+    assert calls[0]["layout"] == "smpl24"
     (one,) = json.loads((tmp_path / "out" / "report.json").read_text())["people"]
     assert one["name"] == "a/0" and one["camera"]["source"] == "file"
     np.testing.assert_allclose(one["camera"]["focal"], [500, 400], rtol=1e-5)
@@ -354,8 +354,8 @@ def test_keypoints_of_smpl_on_a_body_file(calls, tmp_path, rng, monkeypatch, cap
     ("words", "message"),
     [
         (["--people", "5"], "people must be rows 0 to 1, ranges of them or names such as 'a/0'"),
-        (["--joints", "body25"], "person 0 in "),
-        (["--joints", "cocoa"], "layout must be one of"),
+        (["--layout", "body25"], "person 0 in "),
+        (["--layout", "cocoa"], "layout must be one of"),
         (["--robust", "0"], "robust must be a positive number of pixels, auto or off: got 0"),
         (["--camera", "missing.json"], "camera file must exist: got 'missing.json'"),
         (["--camera", "c.json", "--focal", "900"], "camera must be given as a file, or by focal"),
@@ -504,4 +504,4 @@ def test_help(capsys):
         main(["fit", "--help"])
     text = capsys.readouterr().out
     assert stop.value.code == 0 and "usage: spt-jax fit" in text
-    assert all(word in text for word in ("--joints", "--camera", "--robust", "--quiet"))
+    assert all(word in text for word in ("--layout", "--camera", "--robust", "--quiet"))

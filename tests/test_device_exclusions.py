@@ -98,9 +98,9 @@ def test_what_is_enclosed_at_rest_does_not_count():
             )
         )
 
-    exact = penalty(2, "numpy", "auto")
+    exact = penalty(2, "numpy", None)
     assert exact == pytest.approx(0.3 * 0.88 * 0.92, rel=1e-6)
-    assert penalty(1, "numpy", "auto") == 0
+    assert penalty(1, "numpy", None) == 0
     for backend in ("numpy", "xla"):
         assert penalty(1, backend) == 0
         assert penalty(2, backend) == pytest.approx(exact, rel=5e-3)

@@ -35,7 +35,7 @@ def call(monkeypatch, untyped):
 
     def called(**changed):
         given = {"body": embedded_body(), "keypoints": POINTS, "camera": camera()}
-        given |= {"joints": "smpl", "regulariser": "none"} | changed
+        given |= {"layout": "smpl", "regulariser": "none"} | changed
         body, keypoints, eye = (given.pop(name) for name in ("body", "keypoints", "camera"))
         return fit_pose(body, keypoints, eye, **given)
 
@@ -89,9 +89,9 @@ def test_what_is_right_passes(good, call):
         ({"keypoints": SPOILT}, ValueError, r"keypoints must be finite.*got 1 .*\[3\].*to 0"),
         ({"keypoints": [POINTS, SPOILT]}, ValueError, r"keypoints must be finite.*\[1, 3\]"),
         ({"keypoints": POINTS[:17]}, ValueError, "22.*17|17.*22|smpl"),
-        ({"joints": "coco17"}, ValueError, "coco17 has 17 keypoints: got 22"),
-        ({"joints": "mpii"}, ValueError, "mpii"),
-        ({"joints": None}, TypeError, "joints must be .*got NoneType"),
+        ({"layout": "coco17"}, ValueError, "coco17 has 17 keypoints: got 22"),
+        ({"layout": "mpii"}, ValueError, "mpii"),
+        ({"layout": None}, TypeError, "layout must be .*got NoneType"),
         ({"confidence": np.ones(5)}, ValueError, r"confidence must have shape \(..., 22\).*\(5,\)"),
         ({"confidence": np.ones((3, 22))}, ValueError, r"confidence must fit .*\(3, 22\)"),
         ({"confidence": -ONES}, ValueError, "confidence .*not negative: got -1"),

@@ -40,7 +40,7 @@ def fitted(body, embrace):
     joints = body(poses, translation=places).joints[:, :22]
     noise = np.random.default_rng(3).normal(scale=3.0, size=(2, 22, 2))
     seen = camera.project(joints) + jnp.asarray(noise, joints.dtype)
-    return fit_people(body, seen, camera, joints="smpl", regulariser="none"), seen
+    return fit_people(body, seen, camera, layout="smpl", regulariser="none"), seen
 
 
 def crossings_between(body, vertices):
@@ -76,4 +76,4 @@ def test_options_that_fit_pose_lacks_are_refused(body):
     camera = PinholeCamera(1200.0, (500.0, 500.0))
     points = np.zeros((2, 22, 2), np.float32)
     with pytest.raises(TypeError, match="options must be those of fit_pose: got 'weight'"):
-        fit_people(body, points, camera, joints="smpl", weight=1.0)
+        fit_people(body, points, camera, layout="smpl", weight=1.0)

@@ -141,7 +141,7 @@ def fitted(body, people, **options):
         body,
         np.stack([person.points for person in people]).astype(np.float32),
         camera,
-        joints="coco17",
+        layout="coco17",
         confidence=np.stack([person.confidence for person in people]).astype(np.float32),
         **options,
     )

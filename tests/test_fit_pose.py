@@ -44,7 +44,7 @@ def people():
 def fit(keypoints, by=None, **options):
     """People in one call, without a regulariser: one compilation for all tests that use it."""
     by = camera() if by is None else by
-    return fit_pose(embedded_body(), keypoints, by, joints="smpl", regulariser="none", **options)
+    return fit_pose(embedded_body(), keypoints, by, layout="smpl", regulariser="none", **options)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def overlap(found):
 def test_the_penalty_frees_bodies_that_collide():
     """The default, as users call it."""
     keypoints = np.asarray(seen(frames(*COLLIDING)))
-    found = fit_pose(embedded_body(), keypoints, camera(), joints="smpl")
+    found = fit_pose(embedded_body(), keypoints, camera(), layout="smpl")
     before, after = overlap(fit(keypoints)), overlap(found)
     assert min(before) > 1  # cm^3
     assert max(after) < 0.2
@@ -227,7 +227,7 @@ def test_ones_own_start_and_regulariser_in_double_precision(x64):
             body,
             keypoints,
             camera(np.float64),
-            joints="smpl",
+            layout="smpl",
             regulariser=Crouch(jnp.asarray([weight])),
             pose=near.at[30].set(0.3),
             translation=shift,
@@ -303,7 +303,7 @@ def test_too_few_steps_are_said():
         embedded_body(),
         np.asarray(seen(frames("walk/0010", "run/0010")))[:, :9],
         camera(),
-        joints=list(range(9)),
+        layout=list(range(9)),
         regulariser="none",
         pose=np.zeros((52, 3)),
         prior=None,

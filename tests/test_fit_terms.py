@@ -200,7 +200,7 @@ def test_order_of_keypoints_and_those_not_seen_do_not_matter(x64, rng):
     order = rng.permutation(22)
     plain = objective(keypoints, confidence=confidence)
     swapped = objective(
-        keypoints[order], confidence=confidence[order], joints=tuple(NAMES[k] for k in order)
+        keypoints[order], confidence=confidence[order], layout=tuple(NAMES[k] for k in order)
     )
     at = plain.pack(Variables(pose * 0.9, plain.start.shape, jnp.zeros(3)))
 
@@ -213,7 +213,7 @@ def test_order_of_keypoints_and_those_not_seen_do_not_matter(x64, rng):
 
     keep = np.arange(22) != 8
     fewer = tuple(name for name, kept in zip(NAMES, keep, strict=True) if kept)
-    without = objective(keypoints[keep], confidence=confidence[keep], joints=fewer)
+    without = objective(keypoints[keep], confidence=confidence[keep], layout=fewer)
     keypoints[8] = 1e5
     unseen = objective(keypoints, confidence=np.where(keep, confidence, 0.0))
     assert without.figure.moving == unseen.figure.moving

@@ -298,9 +298,9 @@ def test_names_a_body_lacks_are_told(rng, untyped):
         (np.eye(52), {"names": "coco17"}, ValueError, "coco17 has 17 keypoints: got 52"),
         ("coco17", {"names": "coco17"}, ValueError, "names must be left out"),
     ]
-    for joints, options, error, message in cases:
+    for layout, options, error, message in cases:
         with pytest.raises(error, match=message):
-            keypoint_regressor(body, joints, **options)
+            keypoint_regressor(body, layout, **options)
     small = _smpl(rng, 24)
     with pytest.raises(ValueError, match="must be a regressor for this body, 24 joints"):
         keypoint_regressor(small, keypoint_regressor(body, "coco17"))

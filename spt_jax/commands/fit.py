@@ -21,7 +21,7 @@ from spt_jax.commands.terminal import (
 def fit(
     keypoints: tyro.conf.Positional[Path],
     out: Path = Path("fitted"),
-    joints: str | None = None,
+    layout: str | None = None,
     camera: Path | None = None,
     focal: float | None = None,
     center: tuple[float, float] | None = None,
@@ -51,8 +51,8 @@ def fit(
     Args:
         keypoints: the file, .json or .npz.
         out: folder for the results, made where missing.
-        joints: the keypoints' layout, such as coco17, body25, h36m17 or smpl24; what the file says
-            if not given.
+        layout: the order of the keypoints, such as coco17, body25, h36m17 or smpl24; what the file
+            says if not given.
         camera: a .json or .npz file with a 3 x 4 matrix, or with focal and center. Without it and
             the next two, one that spans 55 degrees over the image's longer side.
         focal: focal length in pixels.
@@ -89,7 +89,7 @@ def fit(
 
     with user_errors():
         as_fold_distance(fold_distance)
-        file = read_keypoints(keypoints, layout=joints, max_bytes=max_bytes)
+        file = read_keypoints(keypoints, layout=layout, max_bytes=max_bytes)
         chosen, notes = gather(
             keypoints,
             file,
@@ -119,8 +119,8 @@ def fit(
         with user_errors():
             groups = scenes_of(chosen) if together else [[one] for one in chosen]
             model = load_body(body, max_bytes=max_bytes)
-            for layout in {one.person.layout for one in chosen}:
-                keypoint_regressor(model, layout)
+            for order in {one.person.layout for one in chosen}:
+                keypoint_regressor(model, order)
             folder = ensure_folder(out)
         if any(one.camera_source == "estimated" for one in chosen):
             notes.append(
@@ -149,7 +149,7 @@ def fit(
                 pictures, missing = draw(folder, done, model.faces)
                 settings = {
                     "keypoints": str(keypoints),
-                    "joints": joints,
+                    "layout": layout,
                     "people": people,
                     "body": body,
                     **options,

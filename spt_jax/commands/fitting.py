@@ -108,7 +108,7 @@ def fit_everyone(
         state(f"{name}: {wait}fitting", done=len(found))
         start = time.perf_counter()
         options: dict[str, Any] = {
-            "joints": group[0].person.layout,
+            "layout": group[0].person.layout,
             "confidence": np.stack([one.person.confidence for one in group]).astype(np.float32),
             "regulariser": prepared,
             "robust": _robust_scales(group, robust),

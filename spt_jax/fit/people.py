@@ -66,7 +66,7 @@ def fit_people(
     keypoints: Any,
     camera: PinholeCamera,
     *,
-    joints: Any,
+    layout: Any,
     weights: Any = (0.01, 0.1, 1.0, 10.0, 100.0),
     margin: float = 0.002,
     fold_distance: float | None = None,
@@ -84,7 +84,7 @@ def fit_people(
         body: any `BodyModel`.
         keypoints: pixels, (N, K, 2), or a list of N people.
         camera: the one that sees them all.
-        joints: what the keypoints are, as in `fit_pose`.
+        layout: what the keypoints are, as in `fit_pose`.
         weights: of the overlap in cm^3, one for each stage of the scene.
         margin: how far apart surfaces are pushed, in metres.
         fold_distance: how near to each other, along the rest surface and in metres, sheets of one
@@ -110,20 +110,20 @@ def fit_people(
         >>> turned = jnp.zeros((2, 52, 3)).at[:, 0, 0].set(jnp.pi)
         >>> apart = jnp.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
         >>> seen = camera.project(body(turned, translation=apart).joints[:, :22])
-        >>> fit = fit_people(body, seen, camera, joints=body.joint_names[:22])
+        >>> fit = fit_people(body, seen, camera, layout=body.joint_names[:22])
         >>> int(fit.after.crossings_between)
         0
     """
     known = inspect.signature(fit_pose).parameters
     for name in options:
-        if name not in known or name in ("body", "keypoints", "camera", "joints", "max_steps"):
+        if name not in known or name in ("body", "keypoints", "camera", "layout", "max_steps"):
             raise TypeError(f"options must be those of fit_pose: got {name!r}.")
     if isinstance(keypoints, Tracer):
         raise TypeError(
             "keypoints must be known: got a traced array; fit_people decides by the values that "
             "it sees, so call it outside jit, vmap and grad."
         )
-    options = {"joints": joints, "max_steps": max_steps, **options}
+    options = {"layout": layout, "max_steps": max_steps, **options}
     alone = fit_pose(body, keypoints, camera, **options)
     if alone.pose.ndim != 3:
         raise ValueError(

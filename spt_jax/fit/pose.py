@@ -28,7 +28,7 @@ def fit_pose(
     keypoints: Any,
     camera: PinholeCamera,
     *,
-    joints: Any,
+    layout: Any,
     confidence: Any = None,
     regulariser: Literal["spt", "none", "laplacian", "spheres"] | Regulariser = "spt",
     pose: Any = None,
@@ -74,7 +74,7 @@ def fit_pose(
             those. A point whose confidence is 0 may be anything, NaN too.
         camera: a `PinholeCamera`; with one that has no rotation the body comes back in the
             camera's axes.
-        joints: what the K keypoints are: "coco17", "body25", "h36m17", "smpl", or whatever
+        layout: what the K keypoints are: "coco17", "body25", "h36m17", "smpl", or whatever
             `keypoint_regressor` takes.
         confidence: (..., K), 0 for a point that was not seen; all 1 if None.
         regulariser: "spt", the self-intersection penalty; "none"; "spheres" and "laplacian", the
@@ -119,7 +119,7 @@ def fit_pose(
         >>> camera = PinholeCamera(1000.0, (500.0, 500.0), translation=(0.0, 0.0, 4.0))
         >>> turned = jnp.zeros((52, 3)).at[0, 0].set(jnp.pi)  # upright: the image's y points down
         >>> seen = camera.project(body(turned).joints[:22])
-        >>> fit = fit_pose(body, seen, camera, joints=body.joint_names[:22], regulariser="none")
+        >>> fit = fit_pose(body, seen, camera, layout=body.joint_names[:22], regulariser="none")
         >>> bool(jnp.abs(fit.keypoints - seen).max() < 10)  # pixels, of a person of 460
         True
     """
@@ -127,7 +127,7 @@ def fit_pose(
         body,
         keypoints,
         camera,
-        joints=joints,
+        layout=layout,
         confidence=confidence,
         regulariser=regulariser,
         pose=pose,

@@ -92,7 +92,7 @@ def prepare_fit(
     keypoints: Any,
     camera: PinholeCamera,
     *,
-    joints: Any,
+    layout: Any,
     confidence: Any,
     regulariser: Any,
     pose: Any,
@@ -161,7 +161,7 @@ def prepare_fit(
             )
     # Of the body alone, and read on the host: under jit its constants would be tracers there.
     with jax.ensure_compile_time_eval():
-        figure = make_figure(body, keypoint_regressor(body, joints, count=count_points(keypoints)))
+        figure = make_figure(body, keypoint_regressor(body, layout, count=count_points(keypoints)))
     search = Search(
         figure=figure,
         camera=camera,

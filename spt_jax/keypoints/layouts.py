@@ -21,6 +21,8 @@ class Layout(NamedTuple):
             `spt_jax.keypoints.regressor.COMBINATIONS`.
         sigmas: COCO's standard deviation of an annotated point, per square root of the person's
             area; None where the source states none.
+        surface: whether a name that is both a landmark and a joint of some body, such as left_eye,
+            means the landmark on the skin.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Layout(NamedTuple):
     edges: tuple[tuple[int, int], ...]
     points: tuple[str, ...]
     sigmas: tuple[float, ...] | None = None
+    surface: bool = True
 
 
 def side(name: str) -> str:
@@ -82,10 +85,10 @@ _OPENPOSE = {
 }
 
 
-def _layout(name, names, edges, official=None, sigmas=None, at=_AT) -> Layout:
+def _layout(name, names, edges, official=None, sigmas=None, at=_AT, surface=True) -> Layout:
     names = tuple(names)
     points = tuple(at.get(keypoint, keypoint) for keypoint in names)
-    return Layout(name, names, tuple(official or names), tuple(edges), points, sigmas)
+    return Layout(name, names, tuple(official or names), tuple(edges), points, sigmas, surface)
 
 
 # https://cocodataset.org/#format-data: the "keypoints" and "skeleton" (counted from 1 there) of
@@ -183,7 +186,7 @@ def _smpl(count: int) -> Layout:
         if f"{prefix}{parent}" in names:
             parent = f"{prefix}{parent}"
         edges.append((names.index(parent), k))
-    return _layout(f"smpl{count}", names, edges, at={})
+    return _layout(f"smpl{count}", names, edges, at={}, surface=False)
 
 
 #: Every layout by its name.

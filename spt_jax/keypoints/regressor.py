@@ -149,7 +149,7 @@ class KeypointRegressor(eqx.Module):
 
 def keypoint_regressor(
     body: BodyModel,
-    joints: Any,
+    layout: Any,
     *,
     count: int | None = None,
     names: str | Sequence[str] | None = None,
@@ -164,7 +164,7 @@ def keypoint_regressor(
 
     Args:
         body: the body; for landmarks its template and weights are read.
-        joints: one of
+        layout: what each keypoint is; one of
 
             - "coco17", "body25", "openpose18", "h36m17", "smpl22", "smpl24", "smpl52", "smpl55",
               or "smpl" with a `count`;
@@ -174,7 +174,7 @@ def keypoint_regressor(
               with a weight are kept, or (K, J) from the joints; NumPy, JAX or SciPy sparse. Its
               rows sum to 1;
             - a KeypointRegressor, which comes back as it is.
-        count: how many keypoints there are, to be checked against `joints`; None leaves that out.
+        count: how many keypoints there are, to be checked against `layout`; None leaves that out.
         names: names for the rows of a dense regressor: a layout's name or a sequence. By None they
             are "point0", "point1" and so on, and nothing is known about them.
 
@@ -182,7 +182,7 @@ def keypoint_regressor(
         A KeypointRegressor, in the dtype of the body.
 
     Raises:
-        TypeError: `joints` is none of these; the body, or a dense regressor, is traced.
+        TypeError: `layout` is none of these; the body, or a dense regressor, is traced.
         ValueError: an unknown layout; a keypoint that this body lacks; an index out of range; a
             dense regressor that does not fit the body, is not finite or whose rows do not sum to 1;
             another count than `count`.
@@ -194,35 +194,34 @@ def keypoint_regressor(
         >>> regressor.names, len(regressor.vertices)
         (('left_wrist', 'nose'), 1)
     """
-    if isinstance(joints, KeypointRegressor):
-        made = joints
+    if isinstance(layout, KeypointRegressor):
+        made = layout
         if made.joint_weights.shape[-1] != body.num_joints or any(
             vertex >= body.num_vertices for vertex in made.vertices
         ):
             raise ValueError(
-                f"joints must be a regressor for this body, {body.num_joints} joints and "
+                f"layout must be a regressor for this body, {body.num_joints} joints and "
                 f"{body.num_vertices} vertices: got one for {made.joint_weights.shape[-1]} joints "
                 f"and vertices up to {max(made.vertices, default=0)}; make it anew for this body."
             )
-    elif isinstance(joints, str):
-        layout = as_layout(joints, count)
-        surface = not layout.name.startswith("smpl")
-        made = _from_names(body, layout.names, layout.points, layout.name, surface=surface)
-    elif _is_sequence_of(joints, str):
-        made = _from_names(body, tuple(joints), tuple(joints), "joints", surface=False)
-    elif _is_sequence_of(joints, (int, np.integer)) or _is_row_of_indices(joints):
-        made = _from_indices(body, [int(index) for index in joints])
+    elif isinstance(layout, str):
+        known = as_layout(layout, count)
+        made = _from_names(body, known.names, known.points, known.name, surface=known.surface)
+    elif _is_sequence_of(layout, str):
+        made = _from_names(body, tuple(layout), tuple(layout), "layout", surface=False)
+    elif _is_sequence_of(layout, (int, np.integer)) or _is_row_of_indices(layout):
+        made = _from_indices(body, [int(index) for index in layout])
     else:
-        made = _from_dense(body, joints, names)
+        made = _from_dense(body, layout, names)
         names = None
     if names is not None:
         raise ValueError(
-            "names must be left out where joints is no dense regressor: its keypoints have names, "
+            "names must be left out unless layout is a dense regressor: its keypoints have names, "
             f"{', '.join(made.names[:3])}, ..."
         )
     if count is not None and count != len(made.names):
         raise ValueError(
-            f"joints must give as many keypoints as there are: got {len(made.names)} for {count} "
+            f"layout must give as many keypoints as there are: got {len(made.names)} for {count} "
             "keypoints."
         )
     return made
@@ -246,7 +245,7 @@ def _from_indices(body: BodyModel, indices: list[int]) -> KeypointRegressor:
     for index in indices:
         if not 0 <= index < body.num_joints:
             raise ValueError(
-                f"joints must be from 0 to {body.num_joints - 1}, the body's joints: got {index}; "
+                f"layout must be from 0 to {body.num_joints - 1}, the body's joints: got {index}; "
                 "indices are 0-based."
             )
     rows = [{body.joint_names[index]: 1.0} for index in indices]
@@ -304,35 +303,35 @@ def _assemble(
 
 
 def _from_dense(
-    body: BodyModel, joints: Any, names: str | Sequence[str] | None
+    body: BodyModel, layout: Any, names: str | Sequence[str] | None
 ) -> KeypointRegressor:
-    if isinstance(joints, Tracer):
-        raise TypeError("joints must be known: got a traced array; make the regressor outside jit.")
+    if isinstance(layout, Tracer):
+        raise TypeError("layout must be known: got a traced array; make the regressor outside jit.")
     try:
-        given = np.asarray(joints.toarray() if hasattr(joints, "toarray") else joints)
+        given = np.asarray(layout.toarray() if hasattr(layout, "toarray") else layout)
     except ValueError:  # rows of different lengths
         given = np.empty(0, object)
     if not (np.issubdtype(given.dtype, np.floating) or np.issubdtype(given.dtype, np.integer)):
         raise TypeError(
-            "joints must be a layout's name, a list of names or of joint indices, or an array of "
-            f"weights: got {type(joints).__name__}."
+            "layout must be a layout's name, a list of names or of joint indices, or an array of "
+            f"weights: got {type(layout).__name__}."
         )
     columns = given.shape[-1] if given.ndim == 2 and len(given) else -1
     if columns not in (body.num_vertices, body.num_joints):
         raise ValueError(
-            f"joints must be (K, {body.num_vertices}), from this body's vertices, or "
+            f"layout must be (K, {body.num_vertices}), from this body's vertices, or "
             f"(K, {body.num_joints}), from its joints: got shape {given.shape}; a regressor made "
             "for SMPL's 6890 vertices fits only a body with SMPL's mesh."
         )
     weights = given.astype(np.float64)
     if not np.isfinite(weights).all():
         row = int(np.flatnonzero(~np.isfinite(weights).all(axis=1))[0])
-        raise ValueError(f"joints must be finite: got NaN or infinity in row {row}.")
+        raise ValueError(f"layout must be finite: got NaN or infinity in row {row}.")
     sums = weights.sum(axis=1)
     if np.abs(sums - 1).max() > 1e-2:
         row = int(np.abs(sums - 1).argmax())
         raise ValueError(
-            f"joints must have rows that sum to 1, or keypoints would not move with the body: got "
+            f"layout must have rows that sum to 1, or keypoints would not move with the body: got "
             f"{sums[row]:.4g} in row {row}; divide each row by its sum."
         )
     dtype = body.template.dtype
