@@ -14,7 +14,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,8 +42,9 @@ from spt_jax import (
 # of the time that is left, against the first of them.
 _GROWTH = 1.05
 _WARMING = 1 / 6
-# Seconds without a single step, compiling included, after which a thread stands still.
-_STANDSTILL = 300.0
+# Samples, of one a second, without a single step, compiling included, after which a thread stands
+# still. Not seconds: a machine that gives this process none takes no samples either.
+_STANDSTILL = 600
 
 
 @dataclass
@@ -63,19 +64,22 @@ class Job:
     name: str
     steps: Iterator[None]
     done: int = 0
-    last: float = field(default_factory=time.monotonic)
+    waited: int = 0
     error: str = ""
 
     def run(self, leaving: threading.Event) -> None:
         try:
             for _ in self.steps:
-                self.done, self.last = self.done + 1, time.monotonic()
+                self.done, self.waited = self.done + 1, 0
                 if leaving.is_set():
                     return
         except Exception:
             self.error = traceback.format_exc()
-        finally:
-            self.last = time.monotonic()
+
+    def stands_still(self) -> bool:
+        """Whether it has not come on for long; asked once a second."""
+        self.waited += 1
+        return not self.error and self.waited > _STANDSTILL
 
 
 class Sample(NamedTuple):
@@ -272,11 +276,12 @@ def soaked(settings: Settings) -> tuple[list[Job], list[Sample], Sample, Sample]
             time.sleep(1.0)
             samples.append(sampled(begin))
             bar.update(task, completed=int(samples[-1].seconds))
-            if any(job.error for job in jobs) or any(map(_stands_still, jobs)):
+            still = [job for job in jobs if job.stands_still()]
+            if still or any(job.error for job in jobs):
                 break
     leaving.set()
     for thread, job in zip(threads, jobs, strict=True):
-        while thread.is_alive() and not _stands_still(job):
+        while thread.is_alive() and not job.stands_still():
             thread.join(1.0)
         if not thread.is_alive():
             job.steps.close()  # type: ignore[attr-defined]  # the view's
@@ -284,10 +289,6 @@ def soaked(settings: Settings) -> tuple[list[Job], list[Sample], Sample, Sample]
     gc.collect()
     time.sleep(2.0)
     return jobs, samples, before, sampled(begin)
-
-
-def _stands_still(job: Job) -> bool:
-    return not job.error and time.monotonic() - job.last > _STANDSTILL
 
 
 def growth_of(samples: list[Sample]) -> float:
@@ -325,7 +326,7 @@ def main(settings: Settings) -> int:
         table.print()
     faults = [f"{job.name} failed:\n{job.error}" for job in jobs if job.error]
     faults += [
-        f"{job.name} stood still for {_STANDSTILL:.0f} s" for job in jobs if _stands_still(job)
+        f"{job.name} stood still for {job.waited} s" for job in jobs if job.waited > _STANDSTILL
     ]
     if growth > _GROWTH:
         faults.append(f"memory grew by {100 * (growth - 1):.1f} %; at most 5 % is allowed")

@@ -5,6 +5,7 @@ import gc
 import sys
 
 import equinox as eqx
+import jax
 
 from spt_jax import host_side
 from spt_jax.bounded_jit import BoundedJit
@@ -37,7 +38,8 @@ def clear_caches() -> None:
                 value.clear()
             elif hasattr(value, "cache_clear") and hasattr(value, "cache_info"):
                 value.cache_clear()
-    eqx.clear_caches()  # and those of JAX
+    eqx.clear_caches()  # its own alone, which refer to programs of JAX
+    jax.clear_caches()
     gc.collect()
     _give_pages_back()
 

@@ -71,6 +71,18 @@ def test_new_values_of_every_option_keep_a_bounded_number_of_things(rng):
     assert not recent._results and not recent._faces and len(manifold._manifolds) == 0
 
 
+def test_compiled_programs_are_given_back_too():
+    """Equinox' own way to clear its caches leaves those of JAX: 370 MB of 60 programs stayed."""
+    client = jax.devices()[0].client
+    for count in range(8, 12):
+        vertices = np.concatenate([PAIR[0], np.zeros((count, 3))])
+        step = lambda v: self_intersection_penalty(v, PAIR[1], margin=0.01)  # noqa: E731
+        jax.value_and_grad(step)(jnp.asarray(vertices, "float32"))
+    assert len(client.live_executables()) >= 8
+    clear_caches()
+    assert len(client.live_executables()) == 0
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_memory_does_not_grow_with_the_number_of_calls(rng):
     """1.3 MB a call were kept once; here 120 calls may keep 10 MB."""
