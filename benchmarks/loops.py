@@ -64,7 +64,7 @@ def _slope(vertices: np.ndarray, faces: np.ndarray, **options: object) -> object
     def loss(moved: jax.Array) -> jax.Array:
         return self_intersection_penalty(moved, faces, **options)  # type: ignore[arg-type]
 
-    return jax.value_and_grad(loss)(jnp.asarray(vertices, "float32"))
+    return jax.value_and_grad(loss)(jax.device_put(np.float32(vertices)))
 
 
 def _directions(rng: np.random.Generator) -> object:
@@ -92,21 +92,24 @@ def _faces(rng: np.random.Generator) -> object:
 def _rest_surfaces(rng: np.random.Generator) -> object:
     faces = rng.permutation(_FACES)
     rest = RestSurface(_VERTICES * rng.uniform(1, 2), faces, distance=float(rng.uniform(0.01, 0.3)))
-    classify_vertices(_VERTICES, faces, folds=rest)
-    return _slope(_VERTICES, faces, folds=rest)
+    classify_vertices(_VERTICES, faces, rest_surface=rest)
+    return _slope(_VERTICES, faces, rest_surface=rest)
 
 
 def _sizes(rng: np.random.Generator) -> object:
-    """Other numbers of vertices and triangles, in batches of other sizes."""
+    """Other numbers of vertices and triangles, in batches of other sizes, at times with a margin.
+
+    Nothing else of JAX stands around the calls: what that compiles for new shapes, JAX keeps.
+    """
     count = int(rng.integers(1, 12))
     more = np.concatenate([_VERTICES + 3.0 * k for k in range(count)])
     faces = np.concatenate([_FACES + len(_VERTICES) * k for k in range(count)])
-    strays = rng.normal(size=(rng.integers(0, 2000), 3))
-    batch = jnp.asarray(np.concatenate([more, strays])[None], "float32")
-    batch = jnp.repeat(batch, int(rng.integers(1, 4)), axis=0)
-    slope = jax.grad(lambda v: self_intersection_penalty(v, faces).sum())
-    classify_vertices(batch[0], faces)
-    return slope(batch)
+    vertices = np.concatenate([more, rng.normal(size=(rng.integers(0, 2000), 3))])
+    classify_vertices(np.float32(vertices), faces)
+    batch = np.float32(np.repeat(vertices[None], rng.integers(1, 4), axis=0))
+    self_intersection_penalty(jax.device_put(batch), faces)
+    margin = 0.01 if rng.integers(20) == 0 else 0.0
+    return _slope(vertices, faces, margin=margin)
 
 
 def _reports(rng: np.random.Generator) -> object:
@@ -131,18 +134,18 @@ def _bodies(rng: np.random.Generator) -> object:
 
 KINDS: dict[str, Call] = {
     "directions": _directions,
-    "directions, xla": _directions_on_device,
     "face groups": _groups,
-    "margins": _margins,
     "faces": _faces,
-    "rest surfaces": _rest_surfaces,
+    "margins": _margins,
     "sizes of meshes and batches": _sizes,
-    "reports": _reports,
+    "rest surfaces": _rest_surfaces,
+    "directions, xla": _directions_on_device,
+    "numbers of rays": _reports,
     "poses and shapes": _bodies,
     "programs": _programs,
 }
-# Of the calls, for those that compile or measure a whole body each time.
-_SHARE = {"poses and shapes": 0.1, "programs": 0.1}
+# Of the calls, for those that compile, or measure far more, each time.
+_SHARE = {"directions, xla": 0.1, "poses and shapes": 0.1, "programs": 0.1}
 
 
 def looped(kind: str, calls: int) -> Held:

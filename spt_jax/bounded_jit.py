@@ -1,5 +1,6 @@
 """`jax.jit` that forgets: programs of shapes that are no longer asked for are given back."""
 
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -24,16 +25,15 @@ class BoundedJit:
     """
 
     def __init__(self, function: Callable[..., Any], most: int = _MOST):
-        self._jitted: Any = jax.jit(function, static_argnums=0)
-        self._most = most
+        self._function, self._most = function, most
         self._lock = threading.Lock()
-        self._seen: set[Any] = set()
+        self._forget()
 
     def __call__(self, static: Any, *arrays: Any) -> Any:
         """The function of its arguments."""
         leaves, structure = jax.tree.flatten(arrays)
-        # Under a trace, nothing is compiled here.
-        if not any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *leaves)):
+        # Under the trace of a program nothing is compiled here; under `jax.grad` alone it is.
+        if not isinstance(jnp.zeros(()), Tracer):
             kind = static, structure, *((leaf.shape, leaf.dtype) for leaf in leaves)
             with self._lock:
                 if kind not in self._seen and len(self._seen) >= self._most:
@@ -50,5 +50,12 @@ class BoundedJit:
             self._forget()
 
     def _forget(self) -> None:
-        self._seen.clear()
-        self._jitted.clear_cache()
+        function = self._function
+
+        @functools.wraps(function)
+        def anew(static: Any, *arrays: Any) -> Any:
+            return function(static, *arrays)
+
+        # A function of its own: JAX's caches, also those of what is derived from it, end with it.
+        self._seen: set[Any] = set()
+        self._jitted: Any = jax.jit(anew, static_argnums=0)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import as_mesh
+from spt_jax.bounded_jit import BoundedJit
 
 # A vertex moves at most this many distances. A box's corner needs 1.73, a cone of 39 degrees at its
 # tip needs 3; the needles beyond would shoot far out of the mesh and into its other parts.
@@ -63,11 +64,10 @@ def inflate(
         [0.6 0.6 0.6]
     """
     vertices, faces = as_mesh(vertices, faces)
-    return _inflate(vertices, faces, jnp.asarray(distance, vertices.dtype))
+    return _inflated(None, vertices, faces, jnp.asarray(distance, vertices.dtype))
 
 
-@jax.jit
-def _inflate(vertices, faces, distance):
+def _inflate(_, vertices, faces, distance):
     finite = jnp.where(jnp.isfinite(vertices), vertices, 0.0)
     normal, angle = _normals_and_angles(finite, faces)
     corner = faces.reshape(-1)
@@ -86,6 +86,9 @@ def _inflate(vertices, faces, distance):
     mean = jnp.where(solid, mean, 1.0) / jnp.where(solid, total, 1.0)
     mitre = jnp.where(solid, largest + jnp.log(mean) / _SHARPNESS, 1.0)
     return vertices + distance * mitre[..., None] * direction
+
+
+_inflated = BoundedJit(_inflate)
 
 
 def _normals_and_angles(vertices, faces):

@@ -16,6 +16,7 @@ from spt_jax import (
     RestSurface,
     classify_vertices,
     clear_caches,
+    geometry,
     host_side,
     self_intersection_penalty,
 )
@@ -42,6 +43,25 @@ def test_a_bounded_jit_forgets_and_still_answers():
     assert jax.jit(lambda x: bounded(2.0, x))(jnp.ones(5)).sum() == 10 and len(bounded) == 2
     bounded.clear()
     assert len(bounded) == 0 and bounded(2.0, jnp.ones(1))[0] == 2
+
+
+@pytest.mark.parametrize("how", ["value", "gradient"])
+def test_a_margin_of_meshes_of_ever_other_sizes_keeps_a_bounded_number_of_programs(how):
+    """Under `jax.grad`, too, where arrays are tracers and programs are compiled all the same."""
+    clear_caches()
+    step = lambda v: self_intersection_penalty(v, PAIR[1], margin=0.01)  # noqa: E731
+    step = jax.grad(step) if how == "gradient" else step
+    live = []
+    before, geometry._inflated._most = geometry._inflated._most, 3
+    try:
+        for count in range(10):
+            vertices = np.concatenate([PAIR[0], np.zeros((count, 3))])
+            step(jax.device_put(np.float32(vertices)))
+            live.append(len(jax.devices()[0].client.live_executables()))
+    finally:
+        geometry._inflated._most = before
+    assert len(geometry._inflated) == 1
+    assert max(live[3:]) <= max(live[:3]), live
 
 
 def test_new_values_of_every_option_keep_a_bounded_number_of_things(rng):
