@@ -4,10 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -154,6 +156,49 @@ def test_one_that_is_stopped_is_not_waited_for_and_given_up_in_the_end(pool, exe
     worker._awaited = dict.fromkeys(worker._awaited, -1e9)  # as if a minute had passed
     check(pool, executor, batch())
     assert worker._process.poll() is not None and len(pool._losses) == 1
+
+
+@contextmanager
+def starved(worker, runs=0.002, rests=0.06):
+    """The worker gets a thirtieth of its time, as on a machine that is busy with other things."""
+    ended = threading.Event()
+
+    def take_turns():
+        while not ended.wait(runs):
+            worker._process.send_signal(signal.SIGSTOP)
+            ended.wait(rests)
+            worker._process.send_signal(signal.SIGCONT)
+
+    thread = threading.Thread(target=take_turns)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+@pytest.mark.slow
+def test_one_that_is_slow_does_what_it_can_and_holds_nobody_up(pool, executor, monkeypatch):
+    """It takes a mesh when it is done with its last one, so that most are measured here."""
+    worker = until_ready(pool)
+    check(pool, executor, batch())  # what is usual
+    usual = pool._pace.patience(*kind_of(batch()[0]))
+    asked = []
+    measure = type(worker).measure
+    monkeypatch.setattr(
+        type(worker), "measure", lambda self, *given: asked.append(given) or measure(self, *given)
+    )
+    with starved(worker):
+        for _ in range(3):
+            check(pool, executor, batch(12))
+        assert 1 <= len(asked) <= 18 and not pool._losses
+        # Being slow is not learned as what is usual, by which its lateness is told.
+        assert pool._pace.patience(*kind_of(batch()[0])) < 20 * usual
+    assert until_ready(pool) is worker
+    asked.clear()
+    check(pool, executor, batch(12))
+    assert asked and worker._process.poll() is None and not pool._losses
 
 
 def test_a_single_mesh_is_not_kept_waiting_either(pool, executor, monkeypatch):

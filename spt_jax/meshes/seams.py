@@ -55,7 +55,7 @@ def closed_seams(
 
 
 def _are_among(keys: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """`np.isin`, by sorting: NumPy's hash table took 2 s for 786,000 of these keys, and this 0.2 s."""
+    """`np.isin`, by sorting: for 786,000 of these keys NumPy's hash table took 2 s, this 0.2 s."""
     ordered = np.append(np.sort(known), np.iinfo(np.int64).max)
     return ordered[np.searchsorted(ordered[:-1], keys)] == keys
 
