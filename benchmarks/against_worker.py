@@ -39,7 +39,7 @@ def main() -> None:
     def classify(v):
         found = spt_jax.classify_vertices(v, body.faces)
         # Before its first release, VertexLabels had another field name.
-        return found.labels if hasattr(found, "labels") else found.label
+        return vars(found)["labels" if hasattr(found, "labels") else "label"]
 
     classify = jax.jit(classify)
     calls = {

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from spt_jax import RestSurface
 from spt_jax.exclusions import as_exclusions
-from spt_jax.overlap.exact import ExactOverlap
+from spt_jax.overlap.exact import ExactOverlap, Judged
 from spt_jax.overlap.surface import ExactSurface
 
 _ROUNDING = float(np.finfo(np.float64).eps)
@@ -47,13 +47,21 @@ class Pieces(NamedTuple):
     of_part: Int[np.ndarray, "H"]
 
 
+def judged_of(overlap: ExactOverlap) -> Judged:
+    """What was judged by contours: there is something wherever folds are told."""
+    judged = overlap.judged
+    if judged is None:
+        raise ValueError("the overlap must be judged by a rest surface: got one of whole parts.")
+    return judged
+
+
 def pieces_of(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], rest: RestSurface
 ) -> Pieces:
     """The regions, contours and boundaries of one connected surface."""
     surface = ExactSurface(vertices, faces, _ROUNDING)
     overlap = ExactOverlap(surface, as_exclusions(None, (), rest, faces))
-    judged = overlap.judged
+    judged = judged_of(overlap)
     layer, region, count = judged.layer, judged.region, len(judged.volume)
     scale = surface.scale
     corners = surface.points[surface.manifold.faces[layer.shares.faces]] / scale
@@ -119,7 +127,7 @@ def by_field(pieces: Pieces, everywhere: bool = False) -> float:
         pieces: of a mesh.
         everywhere: whether all contours weigh, and not only the region's own.
     """
-    weight = pieces.overlap.pair_weights[pieces.overlap.judged.layer.segments]
+    weight = pieces.overlap.pair_weights[judged_of(pieces.overlap).layer.segments]
     total = 0.0
     for start in range(0, len(pieces.place), 256):
         rows = slice(start, start + 256)
@@ -137,5 +145,6 @@ def slope_with_shares_held(pieces: Pieces) -> Float[np.ndarray, "V 3"]:
     """(a)'s gradient as it would be if the shares did not change."""
     overlap = pieces.overlap
     held = ExactOverlap(overlap.surface, overlap._exclusions)
-    held.__dict__["judged"] = overlap.judged._replace(volume=0 * overlap.judged.volume)
+    judged = judged_of(overlap)
+    held.__dict__["judged"] = judged._replace(volume=0 * judged.volume)
     return held.gradient()

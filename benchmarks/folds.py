@@ -30,6 +30,7 @@ from benchmarks.fold_candidates import (
     Ramp,
     as_built,
     by_field,
+    judged_of,
     pieces_of,
     slope_with_shares_held,
 )
@@ -410,7 +411,7 @@ def gradients(settings: Settings, frames: Sequence[Frame]) -> Table:
         vertices = np.asarray(body(pose).vertices, np.float64)
         pieces = pieces_of(vertices, faces, rest)
         exact += pieces.overlap.sound
-        share = pieces.overlap.judged.share
+        share = judged_of(pieces.overlap).share
         slope, held = pieces.overlap.gradient(), slope_with_shares_held(pieces)
         velocity = np.sin(vertices @ rng.normal(size=(3, 3)) * 5 + rng.normal(size=3))
         ends = [as_built(pieces_of(vertices + s * velocity, faces, rest)) for s in (1e-7, -1e-7)]

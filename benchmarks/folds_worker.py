@@ -7,6 +7,7 @@ import inspect
 import json
 import sys
 import time
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ def main() -> None:
     faces, rest = np.asarray(body.faces), body.rest_surface
     # Before its first release, the argument had the name of the policy.
     names = inspect.signature(spt_jax.intersection_report).parameters
-    asked = {"rest_surface" if "rest_surface" in names else "folds": rest}
+    asked: dict[str, Any] = {"rest_surface" if "rest_surface" in names else "folds": rest}
     spt_jax.intersection_report(np.asarray(body.template), faces, **asked)
     for line in sys.stdin:
         meshes = np.load(line.strip())["vertices"]

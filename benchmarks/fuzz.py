@@ -101,12 +101,12 @@ def _tried(topic: Topic, seed: int, number: int) -> Case:
     check = importlib.import_module(f"benchmarks.fuzz_{topic}").check
     start = time.monotonic()
     try:
-        found = check(seed, number)
+        row, column, faults = check(seed, number)
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         told = f"{type(error).__name__}: {error} ({where.name}, line {where.lineno})"
-        found = "any", "raised", [told]
-    return Case(topic, number, *found, round(time.monotonic() - start, 4))
+        row, column, faults = "any", "raised", [told]
+    return Case(topic, number, row, column, faults, round(time.monotonic() - start, 4))
 
 
 def _serve(topic: Topic, seed: int, pipe: Any) -> None:

@@ -123,7 +123,7 @@ def two_balls(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     lower = np.array([[1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
     faces = np.concatenate([upper, lower])
     for _ in range(subdivisions):
-        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)[:2]
         vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     # Turned, so that no triangle of one is that of the other moved along an axis.
     turn = trimesh.transformations.rotation_matrix(1.0, [1.0, 2.0, 3.0])[:3, :3]

@@ -91,7 +91,7 @@ def gap(vertices, faces, vertex: int) -> float:
     """How far the nearest triangle is that does not have the vertex as a corner."""
     others = faces[(faces != vertex).all(axis=1)]
     square, *_ = igl.point_mesh_squared_distance(vertices[[vertex]], vertices, others)
-    return float(np.sqrt(square[0]))
+    return float(np.sqrt(np.asarray(square)[0]))
 
 
 def seconds(call) -> float:
@@ -132,11 +132,11 @@ def main(settings: Settings) -> None:
             )
             crossed = has_front & (inside != outside + 1)
             unequal = has_front & (outside != ours)
-            for vertex in np.flatnonzero(~has_front):
+            for vertex in np.flatnonzero(~has_front).tolist():
                 outer, inner = sides(vertices, faces, vertex)
                 unequal[vertex] = ours[vertex] not in outer or ours[vertex] + 1 not in inner
             counts += [len(ours), *map(np.count_nonzero, (ours, ~has_front, crossed, unequal))]
-            for vertex in np.flatnonzero(unequal):
+            for vertex in np.flatnonzero(unequal).tolist():
                 millimetres = 1e3 * gap(vertices, faces, vertex)
                 outer, _ = sides(vertices, faces, vertex)
                 exceptions.append(

@@ -75,12 +75,13 @@ def _screen(vertices):
 def _open3d(vertices, faces) -> Call:
     import open3d
 
+    core: Any = open3d.core  # whose stubs know no arrays
     origins = _screen(vertices)
     rays = np.concatenate([origins, np.broadcast_to(TOWARDS, origins.shape)], axis=1)
-    rays = open3d.core.Tensor(rays.astype(np.float32))
+    rays = core.Tensor(rays.astype(np.float32))
     points, triangles = (
-        open3d.core.Tensor(vertices.astype(np.float32)),
-        open3d.core.Tensor(faces.astype(np.uint32)),
+        core.Tensor(vertices.astype(np.float32)),
+        core.Tensor(faces.astype(np.uint32)),
     )
 
     def call():

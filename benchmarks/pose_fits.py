@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 
 from benchmarks.pose_scenes import Scene, camera, prior_without
-from spt_jax import classify_vertices, fit_pose, load_body
+from spt_jax import BodyModel, classify_vertices, fit_pose, load_body
 from spt_jax.fit.terms.regularisers import (
     Laplacian,
     Nothing,
@@ -58,7 +58,7 @@ class Fitter:
     method: str
     objective: str
     weight: float
-    body: object = field(default_factory=load_body)
+    body: BodyModel = field(default_factory=load_body)
 
     def regulariser(self) -> Regulariser:
         """The method's term, its weight rising over the same stages for all."""

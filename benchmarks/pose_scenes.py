@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -83,9 +83,8 @@ def stored_scenes(path: Path | None, first: int, count: int, seed: int) -> list[
             return found[first : first + count]
     found = list(scenes(0, first + count, seed))
     if path is not None:
-        np.savez(
-            path, **{name: np.stack([getattr(s, name) for s in found]) for name in Scene._fields}
-        )
+        columns: dict[str, Any] = {n: [getattr(s, n) for s in found] for n in Scene._fields}
+        np.savez(path, **columns)
     return found[first:]
 
 

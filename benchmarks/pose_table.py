@@ -10,6 +10,7 @@ scenes with rising weights; those in `pose_fits.WEIGHTS` are the best that it fo
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -55,7 +56,7 @@ class Cache:
 
     def __init__(self, path: Path | None):
         self.path = path
-        self.found: dict[str, np.ndarray] = {}
+        self.found: dict[str, Any] = {}  # arrays
         if path is not None and path.exists():
             with np.load(path) as data:
                 self.found = dict(data)

@@ -122,7 +122,9 @@ def _children(pid: int) -> list[int]:
 def _pair(rng: np.random.Generator, subdivisions: int = 1) -> trimesh.Trimesh:
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     other = ball.copy().apply_translation(rng.uniform(0.3, 0.9, 3))
-    return trimesh.util.concatenate(ball, other)
+    both = trimesh.util.concatenate([ball, other])
+    assert isinstance(both, trimesh.Trimesh)
+    return both
 
 
 def _new_options(rng: np.random.Generator) -> Iterator[None]:
@@ -138,7 +140,9 @@ def _new_options(rng: np.random.Generator) -> Iterator[None]:
             "ignore_groups": ((0, 1),),
         }
         loss = lambda v: self_intersection_penalty(v, mesh.faces, **options)  # noqa: B023, E731
-        jax.block_until_ready(jax.value_and_grad(loss)(jax.device_put(np.float32(mesh.vertices))))
+        jax.block_until_ready(
+            jax.value_and_grad(loss)(jax.device_put(mesh.vertices.astype(np.float32)))
+        )
         yield
 
 
@@ -192,7 +196,7 @@ def _programs(rng: np.random.Generator) -> Iterator[None]:
         step = jax.jit(
             lambda v: self_intersection_penalty(v, mesh.faces, rays=16, directions=turn)  # noqa: B023
         )
-        jax.block_until_ready(step(jax.device_put(np.float32(mesh.vertices))))
+        jax.block_until_ready(step(jax.device_put(mesh.vertices.astype(np.float32))))
         yield
 
 
@@ -202,7 +206,7 @@ def _untangled(rng: np.random.Generator) -> Iterator[None]:
         untangle_pose(body, frames[rng.integers(len(frames))])
         yield
         mesh = _pair(rng, 2)
-        untangle_mesh(np.float32(mesh.vertices), mesh.faces)
+        untangle_mesh(mesh.vertices.astype(np.float32), mesh.faces)
         yield
 
 

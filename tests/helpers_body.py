@@ -4,7 +4,7 @@ import pickle
 import struct
 import sys
 import types
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse
@@ -129,8 +129,9 @@ class Python2Pickler(pickle._Pickler):
 
     def save_string(self, value):
         raw = value.encode("latin1") if isinstance(value, str) else value
-        self.write(pickle.BINSTRING + struct.pack("<i", len(raw)) + raw)
-        self.memoize(value)
+        pickler: Any = self  # of the Pickler in Python, which typeshed takes for that in C
+        pickler.write(pickle.BINSTRING + struct.pack("<i", len(raw)) + raw)
+        pickler.memoize(value)
 
     dispatch[bytes] = save_string
     dispatch[str] = save_string
@@ -140,8 +141,8 @@ def write_official_pkl(path, smpl, monkeypatch):
     """The arrays as SMPL's official files hold them: Python 2, chumpy and a sparse regressor."""
     for name in ("chumpy", "chumpy.ch", "chumpy.reordering"):
         monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    sys.modules["chumpy.ch"].Ch = Ch
-    sys.modules["chumpy.reordering"].Select = Select
+    monkeypatch.setattr(sys.modules["chumpy.ch"], "Ch", Ch, raising=False)
+    monkeypatch.setattr(sys.modules["chumpy.reordering"], "Select", Select, raising=False)
     shapedirs = smpl["shapedirs"]
     values = smpl | {
         "v_template": chumpy_array(smpl["v_template"]),

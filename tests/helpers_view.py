@@ -11,6 +11,7 @@ import msgspec.msgpack
 import viser
 import zstandard
 from websockets.client import ClientProtocol
+from websockets.exceptions import ConnectionClosed
 from websockets.protocol import State
 from websockets.sync.client import connect
 from websockets.uri import parse_uri
@@ -160,9 +161,8 @@ class Browser:
         while True:
             try:
                 self._socket.recv(timeout=SECONDS)
-            except TimeoutError:
-                raise
-            except Exception as closed:
+            except ConnectionClosed as closed:
+                assert closed.rcvd is not None
                 return closed.rcvd.code
 
 

@@ -265,7 +265,7 @@ def test_a_surface_that_cannot_be_measured_is_one_line_wherever_it_comes_up(monk
     assert capsys.readouterr() == ("", said)
 
     def command() -> int:
-        fail()
+        return fail()
 
     monkeypatch.setitem(cli._COMMANDS, "demo", command)
     assert main(["demo"]) == 2

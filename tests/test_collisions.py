@@ -81,7 +81,7 @@ def test_the_order_of_faces_and_vertices_changes_nothing(rng):
     place = rng.permutation(len(vertices))  # of each vertex
     turned = np.take_along_axis(faces, (corner[:, None] + np.arange(3)) % 3, axis=1)
     shuffled = place[turned[order]]
-    rest, posed = np.empty((2, *vertices.shape))
+    rest, posed = (np.empty(vertices.shape) for _ in range(2))
     rest[place], posed[place] = np.asarray(body.template, np.float64), vertices
     surface = RestSurface(rest, shuffled, body.rest_surface.distances[order])
     other = overlap_of(posed, shuffled, as_exclusions(None, (), surface, shuffled))

@@ -81,7 +81,9 @@ def prints(*words):
 #: What is expected of a page's output. A page that shows Python and is missing here fails.
 EXPECTED = {
     "start.md": freed_by_the_first_program,
-    "contributing.md": prints("(6, 3)", "4.0"),
+    "contributing.md": prints(
+        "(6, 3)", "4.0", "[[0 1 2]]", "0.112 of the solid, -0.28 a unit along x"
+    ),
     "recipes/own-body.md": the_worm_is_free,
     "recipes/smplx.md": prints("cm^3 of collisions", "pairs of triangles"),
     "recipes/body-models.md": prints("fit for the penalty", "after"),

@@ -64,7 +64,7 @@ def test_a_flip_looks_the_same_and_lies_on_the_other_side(flipped, x64):
     drawn, redrawn = pixels_of(case, vector[None])[0], pixels_of(case, found)
     eye = camera(np.float64)
     ways = [(True, False), (False, True), (True, True)]
-    for row, (limb, way) in enumerate(itertools.product(limbs, ways)):
+    for row, (limb, way) in enumerate([(limb, way) for limb in limbs for way in ways]):
         first, middle, last = limb
         # All that was moved is this limb's; what hangs at its end comes along.
         below = {j for j in range(22) if limb[0] in ancestors(case.figure.body.parents, j)}

@@ -75,7 +75,7 @@ def test_wholly_immersed_and_inverted_solids_have_eq_9_as_gradient(rng):
     for mesh, count in ((join(inner, outer), len(inner[0])), (inverted(inner), len(inner[0]))):
         volume, gradient = value_and_gradient(mesh, 400)
         normal = igl.per_vertex_normals(*inner)  # outward, whichever way the mesh is wound
-        areas = igl.doublearea(*inner) / 2
+        areas = np.asarray(igl.doublearea(*inner)) / 2
         per_vertex = np.bincount(inner[1].ravel(), np.repeat(areas, 3), count) / 3
         cosine = np.einsum("vi,vi->v", gradient[:count], normal) / np.linalg.norm(
             gradient[:count], axis=1

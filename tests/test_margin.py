@@ -47,7 +47,7 @@ def samples(mesh):
 def gap(first, second):
     """The least distance between two surfaces, from the points of each to the other's triangles."""
     ways = ((first, second), (second, first))
-    squares = [igl.point_mesh_squared_distance(samples(a), *b)[0].min() for a, b in ways]
+    squares = [np.min(igl.point_mesh_squared_distance(samples(a), *b)[0]) for a, b in ways]
     return np.sqrt(min(squares))
 
 

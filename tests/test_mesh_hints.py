@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers import box, inverted, join, sphere
+from trimesh.visual import TextureVisuals
 
 from spt_jax import check_mesh
 
@@ -22,7 +23,7 @@ def seam():
     vertices, faces = box()
     corners, triangles = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     uv = np.random.default_rng(0).random((36, 2))
-    visual = trimesh.visual.TextureVisuals(uv=uv)
+    visual = TextureVisuals(uv=uv)
     return trimesh.Trimesh(corners, triangles, visual=visual, process=False)
 
 

@@ -8,6 +8,8 @@ import pytest
 import trimesh
 from helpers import box, join
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from spt_jax.cli import main
 from spt_jax.mesh_check import check_mesh
@@ -135,8 +137,8 @@ def textured_glb(path):
     corners = vertices[faces].reshape(-1, 3)
     uv = np.random.default_rng(0).random((len(corners), 2))
     picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
-    material = trimesh.visual.material.PBRMaterial(name="skin", baseColorTexture=picture)
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    material = PBRMaterial(name="skin", baseColorTexture=picture)
+    visual = TextureVisuals(uv=uv, material=material)
     triangles = np.arange(len(corners)).reshape(-1, 3)
     mesh = trimesh.Trimesh(corners, triangles, visual=visual, process=False)
     mesh.vertex_normals  # noqa: B018

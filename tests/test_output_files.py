@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from trimesh.visual import ColorVisuals
 
 from spt_jax.mesh_files import (
     BODY_COLOR,
@@ -41,6 +42,7 @@ def test_ply_opens_elsewhere_with_the_same_colours(tmp_path):
     np.testing.assert_allclose(mesh.vertices, vertices, rtol=1e-6)
     np.testing.assert_array_equal(mesh.faces, faces)
     expected = [(*COLOURS[label], 255) for label in labels.tolist()]
+    assert isinstance(mesh.visual, ColorVisuals)
     np.testing.assert_array_equal(mesh.visual.vertex_colors, expected)
 
 

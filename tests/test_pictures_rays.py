@@ -13,12 +13,23 @@ from spt_jax.show.ray_pictures import _telling_ray
 from spt_jax.show.rays import cast_beam, profile
 
 
+def one_mesh(*meshes) -> trimesh.Trimesh:
+    both = trimesh.util.concatenate(list(meshes))
+    assert isinstance(both, trimesh.Trimesh)
+    return both
+
+
+def bundle_of(picture):
+    """What a notebook asks an object for."""
+    return picture._repr_mimebundle_()
+
+
 @pytest.fixture(scope="module")
 def balls():
     """Two unit balls whose centres are 1.2 apart along x and z, above one another along neither."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     moved = ball.copy().apply_translation([0.9, 0.2, 0.7])
-    both = trimesh.util.concatenate(ball, moved)
+    both = one_mesh(ball, moved)
     return np.array(both.vertices), np.array(both.faces)
 
 
@@ -50,7 +61,7 @@ def test_the_images_stand_as_a_picture_does(balls):
     big = vertices.copy()
     big[:, 1] += 3.0 * (vertices[:, 1] > 0.0)  # something high up, and to the body's left
     lone = trimesh.creation.box().apply_translation([4.0, 5.0, 0.0])
-    scene = trimesh.util.concatenate(trimesh.Trimesh(vertices, faces, process=False), lone)
+    scene = one_mesh(trimesh.Trimesh(vertices, faces, process=False), lone)
     count = ray_images(scene.vertices, scene.faces, rays=120).crossings
     rows, columns = np.nonzero(count)
     top = rows < count.shape[0] / 4
@@ -69,7 +80,7 @@ def test_a_profile_is_the_winding_number_along_its_ray():
     ):
         if others[0].extents[0] < 0.6:
             others[0].invert()
-        both = trimesh.util.concatenate([outer, *others])
+        both = one_mesh(outer, *others)
         found = cast_beam(both.vertices, both.faces, "front", 101)
         ray = _telling_ray(found)
         along = profile(found, ray)
@@ -159,10 +170,10 @@ def test_arrows_left_out_lie_beside_one_that_points_their_way(rng):
 
 def test_pictures_show_themselves_in_notebooks_and_only_as_pictures():
     picture = plot_curves({"a": [1.0, 0.1]}, xlabel="step", ylabel="value", title="a $b$")
-    shown = picture._repr_mimebundle_()
+    shown = bundle_of(picture)
     assert shown["image/png"][:8] == b"\x89PNG\r\n\x1a\n"
     assert shown["text/plain"] == "a picture of 720 x 440 pixels"
-    assert picture[..., 0]._repr_mimebundle_() is None
+    assert bundle_of(picture[..., 0]) is None
     assert type(picture / 2) is np.ndarray and isinstance((picture > 0).sum(), np.integer)
 
 

@@ -19,6 +19,7 @@ from helpers import (
     signed_volume,
     sphere,
 )
+from trimesh.exchange.stl import export_stl_ascii
 
 from spt_jax.cli import main
 from spt_jax.mesh_files import read_mesh, write_mesh
@@ -170,7 +171,7 @@ def assert_no_worse(vertices, faces, result):
     assert result.inverted_parts == np.count_nonzero(senses[0] * senses[1] < 0) == 0
     normals = []
     for points in (vertices, result.vertices):
-        a, b, c = np.float64(points)[faces].transpose(1, 0, 2)
+        a, b, c = np.asarray(points, np.float64)[faces].transpose(1, 0, 2)
         normals.append(np.cross(b - a, c - a))
     flipped = np.einsum("fi,fi->f", *normals) < 0
     assert result.flipped_triangles == np.count_nonzero(flipped)
@@ -453,7 +454,7 @@ def test_a_mesh_file_far_from_the_origin_is_not_rounded(suffix, tmp_path, capsys
     if suffix == ".ply":
         write_mesh(file, vertices + offset, faces)
     elif suffix == ".stl":
-        file.write_text(trimesh.exchange.stl.export_stl_ascii(trimesh.Trimesh(vertices, faces)))
+        file.write_text(export_stl_ascii(trimesh.Trimesh(vertices, faces)))
         text = file.read_text().splitlines()
         for k, line in enumerate(text):
             if "vertex" in line:

@@ -31,9 +31,15 @@ def ball_file(tmp_path_factory):
     return path
 
 
+def scene_of(path) -> Scene:
+    scene = files.open_file(path)
+    assert isinstance(scene, Scene)
+    return scene
+
+
 @pytest.fixture
 def balls(ball_file):
-    return files.open_file(ball_file)
+    return scene_of(ball_file)
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +163,7 @@ def test_a_failing_look_is_reported_and_ends_nothing(balls):
 
 
 def test_a_mesh_comes_free_as_untangle_mesh_says(pair_file):
-    scene = files.open_file(pair_file)
+    scene = scene_of(pair_file)
     expected = untangle_mesh(scene.vertices, scene.faces)
     shown = []
     untangle_scene(scene, lambda vertices, text: shown.append(vertices), lambda: False)
@@ -175,7 +181,7 @@ def test_figures_say_what_was_measured(balls, pair_file):
     text = figures(reading, balls, "a & b")
     assert f"{1e6 * reading.volume:.2f} cm³" in text and f">{reading.counts.penetrating}<" in text
     assert "&lt;b&gt;" in text and "a &amp; b" in text and f"rgb{PENETRATING_COLOR}" in text
-    mesh = files.open_file(pair_file)
+    mesh = scene_of(pair_file)
     assert "unit³" in figures(mesh.read(), mesh, "")
 
 
@@ -188,7 +194,7 @@ def test_what_cannot_be_measured_is_said_and_is_not_free(balls, pair_file):
     assert "not measured" in text and "vertices must be finite" in text and ">nan" not in text
     with pytest.raises(ValueError, match="pose must be finite"):
         untangle_scene(balls, lambda vertices, text: None, lambda: False)
-    mesh = files.open_file(pair_file)
+    mesh = scene_of(pair_file)
     mesh.set_free_vertices(mesh.vertices * np.nan)
     with pytest.raises(ValueError, match="vertices must be finite"):
         untangle_scene(mesh, lambda vertices, text: None, lambda: False)
@@ -196,20 +202,21 @@ def test_what_cannot_be_measured_is_said_and_is_not_free(balls, pair_file):
 
 def test_a_mesh_far_from_the_origin_is_not_rounded(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2)
-    pair = trimesh.util.concatenate(ball, ball.copy().apply_translation([1.8, 0.0, 0.0]))
+    vertices = np.concatenate([ball.vertices, np.add(ball.vertices, [1.8, 0.0, 0.0])])
+    faces = np.concatenate([ball.faces, ball.faces + len(ball.vertices)])
     offset = np.array([4e6, -3e5, 123.0])
-    write_mesh(tmp_path / "far.ply", pair.vertices + offset, pair.faces)
-    scene = files.open_file(tmp_path / "far.ply")
-    near = intersection_report(pair.vertices, pair.faces)
+    write_mesh(tmp_path / "far.ply", vertices + offset, faces)
+    scene = scene_of(tmp_path / "far.ply")
+    near = intersection_report(vertices, faces)
     assert scene.read().volume == pytest.approx(near.volume, rel=1e-6)
     untangle_scene(scene, lambda vertices, text: None, lambda: False)
     assert scene.read().free and scene.vertices.dtype == np.float64
-    assert np.abs(scene.vertices - offset - pair.vertices).max() < 0.2
+    assert np.abs(scene.vertices - offset - vertices).max() < 0.2
 
 
 def test_files_are_told_apart(balls, ball_file, pair_file, tmp_path):
     assert balls.body.num_joints == 24 and balls.name == "balls"
-    assert files.open_file(pair_file).body is None
+    assert scene_of(pair_file).body is None
     write_poses(tmp_path / "poses.npz", np.zeros((2, 22, 3)))
     assert isinstance(files.open_file(tmp_path / "poses.npz"), PoseFile)
 
@@ -387,7 +394,8 @@ def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(
         view._do("open", "open_upload", "two.npz", (tmp_path / "two.npz").read_bytes())
         view._do("frame", "choose_frame", 1)
         assert view.worker.wait_until_idle(30)
-        assert view.scene.body.num_vertices == 12_272 and view._status == "two"
+        body = view.scene.body
+        assert body is not None and body.num_vertices == 12_272 and view._status == "two"
     finally:
         assert view.stop_serving()
 

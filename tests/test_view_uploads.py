@@ -12,8 +12,9 @@ pytest.importorskip("viser", reason="the live view needs viser")
 
 from helpers_view import PART, SECONDS, Browser, served, wait_until
 
-from spt_jax.body.pose_files import write_poses
+from spt_jax.body.pose_files import PoseFile, write_poses
 from spt_jax.view import files
+from spt_jax.view.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +139,8 @@ def test_no_name_becomes_a_path(name, ball, tmp_path, monkeypatch):
 
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(Path, "write_bytes", spy)
-    assert files.open_upload(name, ball).name == "evil"
+    opened = files.open_upload(name, ball)
+    assert isinstance(opened, Scene) and opened.name == "evil"
     (path,) = written
     assert path.parent.parent == tmp_path and path.suffix == ".ply" and "evil" not in str(path)
     assert not list(tmp_path.iterdir())
@@ -167,7 +169,7 @@ def test_a_name_is_shown_in_one_printable_line(name, label):
 def test_only_a_plain_suffix_reaches_the_disk(name, suffix, monkeypatch):
     seen = []
 
-    def refuse(path, name):
+    def refuse(path, name, **_):
         seen.append(path)
         raise ValueError(f"file must be read: got {str(path)!r}, {path.name!r}, {path.stem!r}")
 
@@ -180,9 +182,10 @@ def test_only_a_plain_suffix_reaches_the_disk(name, suffix, monkeypatch):
 def test_frames_are_called_after_the_file_that_was_sent(tmp_path):
     np.savez(tmp_path / "walk.npz", poses=np.zeros((2, 66)))
     opened = files.open_upload("walk.npz", (tmp_path / "walk.npz").read_bytes())
-    assert opened.names == ["walk/0000", "walk/0001"]
+    assert isinstance(opened, PoseFile) and opened.names == ["walk/0000", "walk/0001"]
     write_poses(tmp_path / "named.npz", np.zeros((1, 22, 3)), names=["mine"])
-    assert files.open_upload("x.npz", (tmp_path / "named.npz").read_bytes()).names == ["mine"]
+    named = files.open_upload("x.npz", (tmp_path / "named.npz").read_bytes())
+    assert isinstance(named, PoseFile) and named.names == ["mine"]
 
 
 def test_a_file_that_names_another_file_does_not_get_it(tmp_path):
@@ -202,4 +205,5 @@ def test_a_file_that_names_another_file_does_not_get_it(tmp_path):
             | {"buffers": [b | {"uri": f"secret{k}.bin"} for k, b in enumerate(tree["buffers"])]}
         )
     )
-    assert len(files.open_file(tmp_path / "a.gltf").faces) == 80  # in its own folder it does
+    scene = files.open_file(tmp_path / "a.gltf")  # in its own folder it does
+    assert isinstance(scene, Scene) and len(scene.faces) == 80
