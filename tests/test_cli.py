@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers_body import synthetic_smpl
+from trimesh.visual import ColorVisuals
 
 from spt_jax import cli
 from spt_jax.body import load_mocap
@@ -107,6 +108,7 @@ def test_demo_without_pictures(calls, tmp_path, capsys, monkeypatch):
     assert poses.names == list(DEMO_FRAMES[:2]) and poses.pose.shape == (2, 52, 3)
     np.testing.assert_allclose(poses.pose, [0.05 * call["pose"] for call in calls])
     mesh = trimesh.load_mesh(folder / "punch_0013_before.ply", process=False)
+    assert isinstance(mesh.visual, ColorVisuals)
     assert len(mesh.vertices) == 12272 and len(np.unique(mesh.visual.vertex_colors, axis=0)) == 2
 
 
