@@ -250,7 +250,9 @@ def contact_table(settings: Settings, bar) -> Table:
             placed = vertices @ _turn(rng).T + rng.normal(size=3)
             start = time.perf_counter()
             found = exactly((placed, faces))
-            bad = found.volume != 0 or found.total_crossing_pairs or found.labels("vertex").any()
+            bad = (
+                found.volume != 0 or found.total_intersecting_pairs or found.labels("vertex").any()
+            )
             seconds.append(time.perf_counter() - start)
             wrong += bool(bad)
         rows.append((name, f"{wrong} of {settings.turns}", f"{1e3 * np.median(seconds):.1f}"))

@@ -83,7 +83,7 @@ def untangled(index: int) -> tuple[Frame, np.ndarray, np.ndarray]:
         steps=int(result.steps),
         seconds=seconds,
         finite=bool(np.isfinite(freed).all() and np.isfinite(np.asarray(result.pose)).all()),
-        free=bool(result.free),
+        free=bool(result.is_free),
         reason=result.reason,
     )
     return frame._replace(after=frame.before if frame.after < 0 else frame.after), vertices, freed
@@ -119,9 +119,9 @@ def tables(frames: list[Frame]) -> list[Table]:
             ),
             ("the others did not move at all", f"{unmoved} of {len(others)}", "all"),
             (
-                "free by its own account, and by ipctk",
-                f"{sum(frame.free for frame in frames)}, "
-                f"{sum(frame.free and not frame.after for frame in frames)}",
+                "collision-free by its own account, and by ipctk",
+                f"{sum(frame.is_free for frame in frames)}, "
+                f"{sum(frame.is_free and not frame.after for frame in frames)}",
                 "the same",
             ),
             ("a value is not finite", str(sum(not frame.finite for frame in frames)), "0"),

@@ -47,10 +47,10 @@ def main(settings: Settings) -> None:
             rows.append(
                 (
                     intersects(vertices),
-                    result.free,
+                    result.is_free,
                     1e6 * result.before.volume,
                     1e6 * result.after.volume,
-                    result.before.crossings,
+                    result.before.intersecting_pairs,
                     shift.max(),
                     1e2 * result.relative_displacement,
                     shift[shift > 0].mean() if shift.any() else 0.0,
@@ -90,12 +90,12 @@ def main(settings: Settings) -> None:
         [
             ("with intersections before, by ipctk", str(int(columns[0].sum()))),
             ("with intersections after, by ipctk", str(len(still))),
-            ("free after, by its own account", str(int(columns[1].sum()))),
+            ("intersection-free after, by its own account", str(int(columns[1].sum()))),
         ],
     )
     table.print()
     counts.print()
-    listed = f"Not free: {', '.join(still) or 'none'}."
+    listed = f"Not intersection-free: {', '.join(still) or 'none'}."
     print(listed)
     if settings.record:
         command = f"python -m benchmarks.untangle_mesh --frames {settings.frames} --record"

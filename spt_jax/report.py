@@ -29,8 +29,9 @@ class IntersectionReport:
         volumes: the overlap volume that each direction gives; all the same where no rays were
             needed.
         labels: +1 penetrating, -1 inverted, 0 clear, as from `classify_vertices`.
-        crossing_pairs: pairs of triangles that intersect and count, and in all; those that only
-            touch are none.
+        intersecting_pairs: the number of face pairs that intersect and count; faces that only touch
+            do not intersect.
+        total_intersecting_pairs: the same with what does not count.
         rays: as requested: None (exact), rays along the longer side of each screen, or
             (rows, columns).
         crossings: of rays with triangles, for each beam; none where no rays were needed.
@@ -44,8 +45,8 @@ class IntersectionReport:
         >>> box = trimesh.creation.box()
         >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.3, 0.2]))
         >>> report = intersection_report(pair.vertices, pair.faces)
-        >>> report.intersects, report.num_penetrating, report.as_dict()["num_inverted"]
-        (True, 2, 0)
+        >>> report.is_free, report.num_penetrating, report.as_dict()["num_inverted"]
+        (False, 2, 0)
     """
 
     volume: float
@@ -54,7 +55,8 @@ class IntersectionReport:
     directions: tuple[tuple[float, float, float], ...]
     volumes: tuple[float, ...]
     labels: Int8[np.ndarray, "V"]
-    crossing_pairs: tuple[int, int]
+    intersecting_pairs: int
+    total_intersecting_pairs: int
     rays: Rays
     crossings: tuple[int, ...]
     open_rays: tuple[int, ...]
@@ -81,18 +83,19 @@ class IntersectionReport:
         return count_labels(self.labels).ratio
 
     @property
-    def intersects(self) -> bool:
-        """Whether triangles intersect, or parts overlap, where that counts."""
-        return self.crossing_pairs[0] > 0 or self.volume > 0
+    def is_free(self) -> bool:
+        """Whether no faces intersect and no parts overlap, where that counts."""
+        return not (self.intersecting_pairs or self.volume > 0)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the labels, as JSON types; volumes in the cube of the mesh's unit."""
         return {
-            "intersects": self.intersects,
+            "is_free": self.is_free,
             "volume": self.volume,
             "exact": self.exact,
             "total_volume": self.total_volume,
-            "crossing_pairs": {"counted": self.crossing_pairs[0], "all": self.crossing_pairs[1]},
+            "intersecting_pairs": self.intersecting_pairs,
+            "total_intersecting_pairs": self.total_intersecting_pairs,
             "solid_volume": self.solid_volume,
             "ratio": self.ratio,
             "num_penetrating": self.num_penetrating,
@@ -123,8 +126,9 @@ class IntersectionReport:
         # A mesh does not say what its unit is, so the cube is of "the unit", never of a metre.
         table = Table.grid(padding=(0, 2))
         table.add_row("overlap volume", f"{self.volume:.4g} unit³{share}")
-        if self.total_volume != self.volume or self.crossing_pairs[0] != self.crossing_pairs[1]:
-            table.add_row("with what does not count", f"{self.total_volume:.4g} unit³")
+        counted, pairs = self.intersecting_pairs, self.total_intersecting_pairs
+        if self.total_volume != self.volume or counted != pairs:
+            table.add_row("with what is excluded", f"{self.total_volume:.4g} unit³")
         table.add_row("solid volume", f"{self.solid_volume:.4g} unit³")
         table.add_row("ratio (Eq. 11)", f"{self.ratio:.3%} of {len(self.labels)} vertices")
         table.add_row(
@@ -132,9 +136,8 @@ class IntersectionReport:
             f"{self.num_penetrating} penetrating, {self.num_inverted} inverted, "
             f"{self.num_clear} clear",
         )
-        counted, pairs = self.crossing_pairs
-        ignored = f", {pairs - counted} more that do not count" if pairs > counted else ""
-        table.add_row("intersecting triangles", f"{counted} pairs{ignored}")
+        ignored = f", {pairs - counted} more excluded" if pairs > counted else ""
+        table.add_row("intersecting pairs", f"{counted}{ignored}")
         for direction, volume, crossings, lost in zip(
             self.directions, self.volumes, self.crossings, self.open_rays, strict=False
         ):
@@ -204,7 +207,8 @@ def intersection_report(
         directions=sampling.directions,
         volumes=tuple(found.volumes),
         labels=found.labels(wanted),
-        crossing_pairs=(found.crossing_pairs, found.total_crossing_pairs),
+        intersecting_pairs=found.intersecting_pairs,
+        total_intersecting_pairs=found.total_intersecting_pairs,
         rays=sampling.rays,
         crossings=tuple(beam.crossings for beam in found.beams),
         open_rays=tuple(beam.open_rays for beam in found.beams),

@@ -34,7 +34,11 @@ def calls(monkeypatch):
         pose = 0.05 * pose
         vertices = body(pose, shape, translation).vertices
         return SimpleNamespace(
-            pose=pose, vertices=vertices, steps=np.int32(7), free=np.bool_(True), reason="free"
+            pose=pose,
+            vertices=vertices,
+            steps=np.int32(7),
+            is_free=np.bool_(True),
+            reason="collision-free",
         )
 
     replace_untangle_pose(monkeypatch, stand_in)
@@ -93,7 +97,7 @@ def test_demo_without_pictures(calls, tmp_path, capsys, monkeypatch):
     assert "spt-jax[viz]" in captured.err
     assert "punch/0013" in captured.out and "cm³" in captured.out and "\x1b" not in captured.out
     # Nothing is left out: the skin is freed of its folds, too.
-    assert "left out as folds: 0.00 cm³ and 0 pairs before" in captured.out
+    assert "left out as folds: 0.00 cm³ and 0 intersecting pairs before" in captured.out
 
     report = json.loads((folder / "report.json").read_text())
     assert report["picture"] is None and "pyvista" in report["picture_left_out"]
@@ -103,7 +107,7 @@ def test_demo_without_pictures(calls, tmp_path, capsys, monkeypatch):
     for frame in report["frames"]:
         assert frame["before"]["volume"] > 1e-5 > frame["after"]["volume"]
         assert frame["steps"] == 7 and frame["seconds"] > 0
-        assert frame["free"] and frame["reason"] == "free"
+        assert frame["is_free"] and frame["reason"] == "collision-free"
     poses = read_poses(folder / "poses.npz")
     assert poses.names == list(DEMO_FRAMES[:2]) and poses.pose.shape == (2, 52, 3)
     np.testing.assert_allclose(poses.pose, [0.05 * call["pose"] for call in calls])
@@ -204,17 +208,20 @@ def test_untangle_of_chosen_frames(calls, tmp_path, capsys):
     assert main([*words, "--meshes"]) == 0
     text = capsys.readouterr().out
     assert "punch/0013" in text and "run/0018" not in text and "6 meshes" in text
-    assert "3 frames, 3 free: " in text
+    assert "3 frames, 3 collision-free: " in text
     (line,) = [line for line in text.splitlines() if line.startswith("left out as folds: ")]
     assert read_poses(out / "poses.npz").names == ["punch/0013", "walk/0005", "walk/0006"]
     assert [call["rays"] for call in calls] == [64] * 3  # half of what the report is made with
     assert len(list(out.glob("*.glb"))) == 6
     report = json.loads((out / "report.json").read_text())
     assert report["settings"]["rays"] == 128 and len(report["meshes"]) == 6
-    counts = [frame["before"]["crossing_pairs"] for frame in report["frames"]]
-    pairs = sum(count["all"] - count["counted"] for count in counts)
+    counts = [frame["before"] for frame in report["frames"]]
+    pairs = sum(c["total_intersecting_pairs"] - c["intersecting_pairs"] for c in counts)
     volume = sum(f["before"]["total_volume"] - f["before"]["volume"] for f in report["frames"])
-    assert f"{1e6 * volume:.2f} cm³ and {pairs} pairs before, " in line and pairs > 0 < volume
+    assert (
+        f"{1e6 * volume:.2f} cm³ and {pairs} intersecting pairs before, " in line
+        and pairs > 0 < volume
+    )
 
     assert main([*words, "--json"]) == 0
     captured = capsys.readouterr()
@@ -233,10 +240,10 @@ def test_what_is_a_fold_is_set_from_the_command_line(calls, tmp_path, capsys):
         text = capsys.readouterr().out
         report = json.loads((tmp_path / "out" / "report.json").read_text())
         (frame,) = report["frames"]
-        found = frame["before"]["crossing_pairs"]
-        counted[" ".join(words)] = found["counted"]
-        left = found["all"] - found["counted"]
-        assert f"and {left} pairs before" in text
+        found = frame["before"]
+        counted[" ".join(words)] = found["intersecting_pairs"]
+        left = found["total_intersecting_pairs"] - found["intersecting_pairs"]
+        assert f"and {left} intersecting pairs before" in text
         volume = 1e6 * (frame["before"]["total_volume"] - frame["before"]["volume"])
         assert f"left out as folds: {volume:.2f} cm³" in text
     assert [call["fold_distance"] for call in calls] == [None, 0.0, 9.0, None]

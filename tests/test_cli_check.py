@@ -41,8 +41,8 @@ def test_the_verdict_follows_from_pairs_and_from_volume(dtype, tmp_path, capsys)
             assert ("it does not self-intersect" in text) == (not code)
         assert main(["check", str(path), "--json"]) == code
         found = json.loads(capsys.readouterr().out)["intersection"]
-        assert found["intersects"] == bool(code) and found["exact"]
-        assert (found["crossing_pairs"]["all"] > 0) == (mesh is beams)
+        assert found["is_free"] == (not code) and found["exact"]
+        assert (found["intersecting_pairs"] > 0) == (mesh is beams)
 
 
 def test_a_mesh_whose_exact_sums_do_not_close_is_warned_of(tmp_path, capsys, monkeypatch):

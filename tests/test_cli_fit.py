@@ -233,13 +233,13 @@ def test_people_of_an_image_together(calls, tmp_path, rng, monkeypatch, capsys):
     assert scene["before"] == {
         "volume_between": pytest.approx(2e-6),
         "volume_within": pytest.approx(1e-6),
-        "crossings_between": 9,
-        "crossings_within": 4,
+        "intersecting_pairs_between": 9,
+        "intersecting_pairs_within": 4,
     }
     assert set(scene["after"].values()) == {0}
     text = " ".join(capsys.readouterr().out.split())
     assert "2 people together" in text
-    assert "left out as folds: 6.00 cm³ and 9 pairs of triangles" in text
+    assert "left out as folds: 6.00 cm³ and 9 intersecting pairs" in text
 
 
 @pytest.mark.parametrize("words", [[], ["--fold-distance", "0.1"]])
@@ -297,7 +297,8 @@ def no_overlap(vertices, *_, **__):
         directions=(),
         volumes=(),
         labels=np.zeros(len(vertices), np.int8),
-        crossing_pairs=(0, 3),
+        intersecting_pairs=0,
+        total_intersecting_pairs=3,
         rays=None,
         crossings=(),
         open_rays=(),

@@ -255,7 +255,7 @@ def test_regions_are_connected_overlaps():
     assert num_regions(found) == 2
     assert found.volume == pytest.approx(boolean_overlap(bar, yoke), rel=1e-9)
     folded = solved((posed_bodies(["cartwheel/0151"])[0], body_faces()))
-    assert num_regions(folded) == 1 and folded.total_crossing_pairs > 10
+    assert num_regions(folded) == 1 and folded.total_intersecting_pairs > 10
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -347,7 +347,7 @@ def test_lattices_of_boxes_that_touch_are_free():
     places = np.stack(np.meshgrid(*[np.arange(10.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for mesh in (lattice := join(*(box(center=place) for place in places)), _turned(lattice)):
         found = solved(mesh)
-        assert found.volume == 0 and found.total_crossing_pairs == 0
+        assert found.volume == 0 and found.total_intersecting_pairs == 0
         assert not found.gradient("boundary", "vertex").any()
         assert not found.labels("vertex").any()
 
@@ -427,7 +427,7 @@ def test_one_unit_in_the_last_place_changes_nothing(name):
         assert found.volume == pytest.approx(expected, rel=1e-12, abs=0)
         if expected == 0:
             assert not found.gradient("boundary", "vertex").any()
-            assert found.total_crossing_pairs == 0 and not found.labels("vertex").any()
+            assert found.total_intersecting_pairs == 0 and not found.labels("vertex").any()
 
 
 def test_slabs_that_meet_in_points_without_edges():

@@ -86,7 +86,7 @@ def test_the_order_of_faces_and_vertices_changes_nothing(rng):
     surface = RestSurface(rest, shuffled, body.rest_surface.distances[order])
     other = overlap_of(posed, shuffled, as_exclusions(None, (), surface, shuffled))
     assert other.volume == pytest.approx(found.volume, rel=1e-9)
-    assert other.crossing_pairs == found.crossing_pairs
+    assert other.intersecting_pairs == found.intersecting_pairs
     gradient = found.gradient()
     np.testing.assert_allclose(
         other.gradient()[place], gradient, rtol=0, atol=1e-9 * np.abs(gradient).max()

@@ -122,7 +122,7 @@ def test_a_far_end_that_touches_counts():
     found = measured(ring, rest_surface=rest)
     assert found.volume == whole.volume == found.total_volume
     np.testing.assert_array_equal(found.labels("vertex"), whole.labels("vertex"))
-    assert found.crossing_pairs == whole.crossing_pairs
+    assert found.intersecting_pairs == whole.intersecting_pairs
     assert measured(ring, rest_surface=rest.within(100.0)).volume == 0
 
 
@@ -133,7 +133,7 @@ def test_a_fold_does_not_count():
     found = measured(mesh, rest_surface=rest.within(1.0))
     assert found.volume == 0 and found.total_volume == pytest.approx(whole.volume, rel=1e-12)
     assert not found.labels("vertex").any() and not found.gradient("boundary", "vertex").any()
-    assert found.crossing_pairs == 0 < whole.crossing_pairs
+    assert found.intersecting_pairs == 0 < whole.intersecting_pairs
     assert measured(mesh, rest_surface=rest.within(0.0)).volume == pytest.approx(
         whole.volume, rel=1e-12
     )
@@ -154,15 +154,17 @@ def test_penalty_labels_and_report_agree_on_bodies(frame, x64):
     np.testing.assert_array_equal(report.labels, label)
     whole = intersection_report(vertices, faces)
     assert report.total_volume == pytest.approx(whole.volume, rel=1e-12)
-    assert report.crossing_pairs[1] == whole.crossing_pairs[0] > 0
+    assert report.total_intersecting_pairs == whole.intersecting_pairs > 0
     # A vertex that counts is one of the overlap.
     np.testing.assert_array_equal(np.where(report.labels != 0, whole.labels, 0), report.labels)
     if FRAMES[frame]:
         assert 0.01 * whole.volume < value < 0.5 * whole.volume
-        assert report.labels.any() and 0 < report.crossing_pairs[0] < report.crossing_pairs[1]
+        assert (
+            report.labels.any() and 0 < report.intersecting_pairs < report.total_intersecting_pairs
+        )
         assert "with what does not count" in str(report)
     else:
-        assert value == 0 and not report.labels.any() and report.crossing_pairs[0] == 0
+        assert value == 0 and not report.labels.any() and report.intersecting_pairs == 0
 
 
 def test_nothing_left_out_is_the_whole(x64):
@@ -257,12 +259,12 @@ def test_turning_the_body_turns_no_fold_into_a_collision(rng):
     for name, collides in (("run/0005", False), ("cartwheel/0103", True)):
         (vertices,) = posed_bodies([name])
         straight = intersection_report(vertices, body_faces(), rest_surface=rest)
-        assert (straight.volume > 0) == (straight.crossing_pairs[0] > 0) == collides
+        assert (straight.volume > 0) == (straight.intersecting_pairs > 0) == collides
         for _ in range(3):
             turned = vertices @ random_rotation(rng).T
             found = intersection_report(turned, body_faces(), rest_surface=rest)
             assert found.volume == pytest.approx(straight.volume, rel=1e-9)
-            assert found.crossing_pairs == straight.crossing_pairs
+            assert found.intersecting_pairs == straight.intersecting_pairs
 
 
 def test_the_rest_surface_of_other_faces_is_refused(untyped):

@@ -43,7 +43,7 @@ def fitted(body, embrace):
     return fit_people(body, seen, camera, layout="smpl", regulariser="none"), seen
 
 
-def crossings_between(body, vertices):
+def intersecting_pairs_between(body, vertices):
     """How often an edge of the one body passes through a triangle of the other, by ipctk."""
     count = body.num_vertices
     both = np.asfortranarray(np.asarray(vertices, np.float64).reshape(-1, 3))
@@ -63,11 +63,11 @@ def crossings_between(body, vertices):
 @pytest.mark.slow
 def test_people_who_embrace_end_apart(body, fitted):
     found, seen = fitted
-    assert int(found.before.crossings_between) > 0
-    assert int(found.after.crossings_between) == 0
-    assert crossings_between(body, found.people.vertices) == 0
-    assert float(found.after.between) == 0.0
-    assert float(found.after.within) <= max(1e-8, float(found.before.within))
+    assert int(found.before.intersecting_pairs_between) > 0
+    assert int(found.after.intersecting_pairs_between) == 0
+    assert intersecting_pairs_between(body, found.people.vertices) == 0
+    assert float(found.after.volume_between) == 0.0
+    assert float(found.after.volume_within) <= max(1e-8, float(found.before.volume_within))
     off = jnp.linalg.norm(found.people.keypoints - seen, axis=-1)
     assert float(off.mean()) < 12.0  # pixels, of people 580 pixels tall, with noise of 3
 

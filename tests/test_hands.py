@@ -48,7 +48,7 @@ def test_hands_that_do_not_collide(name):
     pairs = intersecting_hands(vertices)
     assert (rest_distances(pairs, 2 * THICKNESS) < THICKNESS).all()
     found = overlap_of(vertices)
-    assert found.sound and found.volume == 0 and found.crossing_pairs == 0
+    assert found.sound and found.volume == 0 and found.intersecting_pairs == 0
     assert not found.winding.any() and not found.gradient().any()
 
 

@@ -29,7 +29,7 @@ def unbend(body, pose, *, shape=None, translation=None, share=0.5, **_):
     pose = np.float32(share) * pose
     vertices = body(pose, shape, translation).vertices
     return SimpleNamespace(
-        pose=pose, vertices=vertices, steps=7, free=np.bool_(True), reason="free"
+        pose=pose, vertices=vertices, steps=7, is_free=np.bool_(True), reason="collision-free"
     )
 
 
@@ -206,7 +206,12 @@ def test_digests_tell_dtypes_shapes_and_values_apart():
 
 def test_a_frame_comes_back_to_the_bit(rng):
     report = {"volume": np.float64(1 / 3), "total_volume": 0.1 + 0.2, "solid_volume": 1e-300}
-    report |= {"directions": ((1.0, 0.0, 0.0),), "volumes": (1 / 7,), "crossing_pairs": (1, 2)}
+    report |= {
+        "directions": ((1.0, 0.0, 0.0),),
+        "volumes": (1 / 7,),
+        "intersecting_pairs": 1,
+        "total_intersecting_pairs": 2,
+    }
     report |= {"crossings": (), "open_rays": (), "exact": True, "rays": (3, 4)}
     from spt_jax.commands.frames import Frame
     from spt_jax.report import IntersectionReport
@@ -214,7 +219,13 @@ def test_a_frame_comes_back_to_the_bit(rng):
     labels = np.array([0, 1, -1], np.int8)
     arrays = {"pose": rng.normal(size=(52, 3)).astype(np.float32)}
     arrays |= {name: rng.normal(size=(3, 3)) for name in ("vertices_before", "vertices_after")}
-    facts = {"name": "ä/1", "steps": 3, "seconds": 1 / 3, "free": True, "reason": "free"}
+    facts = {
+        "name": "ä/1",
+        "steps": 3,
+        "seconds": 1 / 3,
+        "is_free": True,
+        "reason": "collision-free",
+    }
     told = IntersectionReport(labels=labels, **report)
     frame = Frame(before=told, after=told, **arrays, **facts)
     for vertices in (True, False):
@@ -234,7 +245,7 @@ from spt_jax.cli import main
 from spt_jax.untangle import pose
 
 class Result:
-    calls, steps, free, reason = 0, 7, True, "free"
+    calls, steps, is_free, reason = 0, 7, True, "collision-free"
 
     def __init__(self, body, given, **_):
         if Result.calls:

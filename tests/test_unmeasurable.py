@@ -68,8 +68,8 @@ def test_everybody_says_so(kind, rays, dtype):
         assert np.isnan(value)  # of a size whose cube is no float32, too
     if dtype == np.float32 and kind in MEASURED:
         measured = intersection_report(vertices, FACES, rays=rays)
-        assert measured.intersects and measured.crossing_pairs[0] > 0 and measured.num_penetrating
-        assert reading.error is None and not reading.free
+        assert not measured.is_free and measured.intersecting_pairs > 0 and measured.num_penetrating
+        assert reading.error is None and not reading.is_free
         assert untangle_mesh(vertices, FACES).after.volume <= measured.volume
         return
     assert not labels.any()
@@ -80,7 +80,7 @@ def test_everybody_says_so(kind, rays, dtype):
     finite = bool(np.isfinite(vertices).all())
     with pytest.raises(ValueError, match=SAID[kind] if finite else "with NaN or infinity"):
         untangle_mesh(vertices, FACES)
-    assert reading.error.startswith(SAID[kind]) and not reading.free
+    assert reading.error.startswith(SAID[kind]) and not reading.is_free
     assert np.isnan(reading.volume) and not reading.labels.any()
 
 

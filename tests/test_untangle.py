@@ -53,7 +53,7 @@ def test_a_pose_without_overlap_comes_back_to_the_bit():
     result = untangle_pose(embedded_body(), pose, **QUICK)
     np.testing.assert_array_equal(result.pose, pose)
     assert result.steps == 0 and result.before.volume == result.after.volume == 0
-    assert result.free and result.reason == "free"
+    assert result.is_free and result.reason == "collision-free"
 
 
 def test_shape_and_translation_are_used_and_kept(x64):
@@ -85,7 +85,7 @@ def test_the_best_pose_seen_is_kept(monkeypatch):
     both = untangle_pose(embedded_body(), pose, weights=(1.0, 2.0), **options)
     assert first.after.volume < 0.9 * first.before.volume
     np.testing.assert_array_equal(both.pose, first.pose)
-    assert both.steps == 20 and not both.free
+    assert both.steps == 20 and not both.is_free
 
 
 def test_collisions_go_and_nothing_else_moves():
@@ -93,10 +93,10 @@ def test_collisions_go_and_nothing_else_moves():
     body = embedded_body()
     pose = frame("cartwheel/0149")
     result = untangle_pose(body, pose)
-    assert result.before.crossings > 20 and result.before.volume > 1e-7
-    assert result.after.crossings == 0 and result.after.volume == 0
+    assert result.before.intersecting_pairs > 20 and result.before.volume > 1e-7
+    assert result.after.intersecting_pairs == 0 and result.after.volume == 0
     assert result.after.total_volume > 0  # the armpits are left as they are
-    assert result.free and result.result == RESULTS.successful
+    assert result.is_free and result.result == RESULTS.successful
     moved = np.linalg.norm(result.vertices - body(pose).vertices, axis=1)
     assert moved.mean() < 0.002 and moved.max() < 0.02
 
@@ -105,7 +105,7 @@ def test_folds_alone_move_nothing():
     body = embedded_body()
     pose = frame("run/0005")
     result = untangle_pose(body, pose)
-    assert result.before.total_volume > 1e-5 and result.before.crossings == 0
+    assert result.before.total_volume > 1e-5 and result.before.intersecting_pairs == 0
     assert result.before.volume == 0 and result.steps == 0
     np.testing.assert_array_equal(result.pose, pose)
     np.testing.assert_array_equal(result.vertices, body(pose).vertices)
@@ -117,8 +117,10 @@ def test_folds_go_by_the_vertices():
     pose = frame("run/0005")
     result = untangle_pose(body, pose, folds="remove")
     np.testing.assert_array_equal(result.pose, pose)
-    assert result.before.total_crossings > 50 and result.after.total_crossings == 0
-    assert result.free and result.after.total_volume == 0
+    assert (
+        result.before.total_intersecting_pairs > 50 and result.after.total_intersecting_pairs == 0
+    )
+    assert result.is_free and result.after.total_volume == 0
     assert has_intersections(body(pose).vertices)
     assert not has_intersections(result.vertices)
     moved = np.linalg.norm(result.vertices - body(pose).vertices, axis=1)
@@ -146,8 +148,8 @@ def test_never_worse_than_the_start():
     )
     np.testing.assert_array_equal(result.pose, pose)
     assert result.after.volume == result.before.volume > 0
-    assert result.steps == 3 and not result.free
-    assert result.result != RESULTS.successful and result.reason != "free"
+    assert result.steps == 3 and not result.is_free
+    assert result.result != RESULTS.successful and result.reason != "collision-free"
 
 
 @functools.cache
@@ -196,7 +198,7 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
     for part in (result.pose, result.vertices, result.after.volume, result.after.ratio):
         assert np.isfinite(part).all()
     np.testing.assert_array_equal(result.pose, swung(2.6))
-    assert result.after.volume == result.before.volume and not result.free
+    assert result.after.volume == result.before.volume and not result.is_free
     assert result.result == RESULTS.nonlinear_divergence and "diverged" in result.reason
     assert len(seen) >= 5 and any(np.isnan(volume) for _, _, volume in seen)
 
@@ -214,7 +216,7 @@ def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
 
     monkeypatch.setattr(untangle, "_descend", sometimes)
     result = untangle_pose(boxes(), swung(2.6, dtype), weights=(0.1, 1.0, 10.0, 100.0, 1000.0))
-    assert result.free and result.after.volume == 0 and result.pose.dtype == dtype
+    assert result.is_free and result.after.volume == 0 and result.pose.dtype == dtype
     assert all(np.isfinite(moved).all() for moved in calls) and len(calls) >= 2
 
 
@@ -229,9 +231,9 @@ def test_each_pose_of_a_batch_says_how_it_ended(monkeypatch):
     monkeypatch.setattr(untangle, "_descend", fails_for_some)
     poses = jnp.stack([swung(angle) for angle in (0.3, 2.6, 2.8)])
     result = untangle_pose(boxes(), poses)
-    assert result.free.tolist() == [True, True, False]
+    assert result.is_free.tolist() == [True, True, False]
     assert (result.result == RESULTS.nonlinear_divergence).tolist() == [False, False, True]
-    assert result.reason[:2] == ["free", "free"] and "diverged" in result.reason[2]
+    assert result.reason[:2] == ["collision-free"] * 2 and "diverged" in result.reason[2]
     assert np.isfinite(result.vertices).all()
 
 
@@ -249,8 +251,8 @@ def test_what_is_a_fold_can_be_set():
     usual, none, wide = (
         untangle_pose(body, pose, fold_distance=distance, **quick) for distance in (None, 0.0, 9.0)
     )
-    assert usual.before.crossings == 0 == wide.before.crossings
-    assert int(none.before.crossings) > 0.9 * int(none.before.total_crossings)
+    assert usual.before.intersecting_pairs == 0 == wide.before.intersecting_pairs
+    assert int(none.before.intersecting_pairs) > 0.9 * int(none.before.total_intersecting_pairs)
     assert none.before.volume > 0.9 * none.before.total_volume
     assert usual.before.total_volume == none.before.total_volume
 

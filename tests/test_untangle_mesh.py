@@ -52,9 +52,9 @@ def test_posed_bodies_come_free_of_collisions_and_folds(name):
     faces = body_faces()
     assert intersects(vertices, faces)
     result = untangle_mesh(vertices, faces)
-    assert result.free and not intersects(result.vertices, faces)
+    assert result.is_free and not intersects(result.vertices, faces)
     assert result.vertices.dtype == np.float32
-    assert result.before.crossings > 0 == result.after.crossings
+    assert result.before.intersecting_pairs > 0 == result.after.intersecting_pairs
     assert result.after.volume < 1e-3 * result.before.volume
     assert result.largest_displacement < 0.08  # in metres, for up to a litre of overlap
 
@@ -78,8 +78,8 @@ SHAPES = {
 def test_other_shapes_come_free(shape, dtype):
     vertices, faces = SHAPES[shape]
     result = untangle_mesh(vertices.astype(dtype), faces)
-    assert result.free == (not intersects(result.vertices, faces))
-    assert result.free and result.vertices.dtype == dtype
+    assert result.is_free == (not intersects(result.vertices, faces))
+    assert result.is_free and result.vertices.dtype == dtype
     assert result.inverted_parts == 0 and result.relative_displacement <= 1.0
 
 
@@ -108,7 +108,7 @@ def test_what_does_not_cross_comes_back_to_the_bit():
         # A part within another, or on its copy, has overlap, but nothing that crosses; the result
         # does not hide it.
         assert result.after.volume == pytest.approx(volume, rel=0.1) and seen == []
-        assert result.free == (volume == 0)
+        assert result.is_free == (volume == 0)
         assert result.result == (RESULTS.enclosed if volume else RESULTS.successful)
         assert ("wholly within another" in result.reason) == (volume > 0)
 
@@ -118,7 +118,7 @@ def test_a_part_that_crosses_nothing_stays_where_it_is():
     vertices, faces = join(two_spheres(1.9), far)
     result = untangle_mesh(vertices, faces)
     still = len(far[0])
-    assert result.free and 0 < result.moved <= len(vertices) - still
+    assert result.is_free and 0 < result.moved <= len(vertices) - still
     np.testing.assert_array_equal(result.vertices[-still:], vertices[-still:])
 
 
@@ -134,7 +134,7 @@ def test_turned_and_shifted_it_goes_as_far(rng):
     mesh = two_spheres(1.5)
     turned = moved(mesh, random_rotation(rng), (3.0, -2.0, 1.0))
     plain, other = untangle_mesh(*mesh), untangle_mesh(*turned)
-    assert other.free
+    assert other.is_free
     assert other.largest_displacement == pytest.approx(plain.largest_displacement, rel=0.1)
 
 
@@ -144,12 +144,12 @@ def test_never_worse_and_bounded_when_it_cannot():
     result = untangle_mesh(
         vertices, faces, attempts=2, steps_per_attempt=1, on_step=lambda *s: seen.append(s)
     )
-    assert not result.free and result.steps == 2
+    assert not result.is_free and result.steps == 2
     assert result.result == RESULTS.nonlinear_max_steps_reached
     assert_no_worse(vertices, faces, result)
     # One part alone is not pushed away from others as it is.
     assert [step[:2] for step in seen] == [(0, 0), (1, 1), (2, 2)]
-    assert seen[0][2] == result.before.crossings
+    assert seen[0][2] == result.before.intersecting_pairs
 
 
 def assert_no_worse(vertices, faces, result):
@@ -160,12 +160,12 @@ def assert_no_worse(vertices, faces, result):
         for points in (vertices, result.vertices)
     )
     for found, told in ((before, result.before), (after, result.after)):
-        assert told.crossings == found.total_crossing_pairs
+        assert told.intersecting_pairs == found.total_intersecting_pairs
         assert told.volume == pytest.approx(found.volume, rel=1e-9, abs=1e-15)
     assert result.vertices.dtype == vertices.dtype
-    assert after.total_crossing_pairs <= before.total_crossing_pairs
+    assert after.total_intersecting_pairs <= before.total_intersecting_pairs
     assert after.volume <= before.volume * (1 + 1e-9)
-    assert result.free == (after.total_crossing_pairs == 0 and after.volume == 0)
+    assert result.is_free == (after.total_intersecting_pairs == 0 and after.volume == 0)
     surface = Surface(faces, len(vertices))
     senses = [surface.part_senses(np.float64(x)) for x in (vertices, result.vertices)]
     assert result.inverted_parts == np.count_nonzero(senses[0] * senses[1] < 0) == 0
@@ -182,7 +182,7 @@ def assert_no_worse(vertices, faces, result):
     assert result.relative_displacement <= 1 + 1e-6
     touched = np.unique(surface.part[np.unique(faces[before.surface.pairs[before.surface.listed]])])
     assert not shift[~np.isin(surface.part, touched)].any()  # what intersects nothing stays
-    if not before.total_crossing_pairs:
+    if not before.total_intersecting_pairs:
         assert result.vertices.tobytes() == vertices.tobytes()
 
 
@@ -229,7 +229,7 @@ def test_contact_is_left_as_it_is(contact, dtype, rng):
         vertices = vertices.astype(dtype)
         result = untangle_mesh(vertices, faces)
         assert result.vertices.tobytes() == vertices.tobytes()
-        assert result.free and result.before.crossings == 0 == result.before.volume
+        assert result.is_free and result.before.intersecting_pairs == 0 == result.before.volume
 
 
 def test_flat_faces_of_many_triangles_are_left_as_they_are(rng):
@@ -245,7 +245,7 @@ def test_flat_faces_of_many_triangles_are_left_as_they_are(rng):
             for dtype in (np.float32, np.float64):
                 given = vertices.astype(dtype)
                 result = untangle_mesh(given, faces)
-                assert result.free and result.vertices.tobytes() == given.tobytes()
+                assert result.is_free and result.vertices.tobytes() == given.tobytes()
 
 
 def test_contact_stays_where_something_else_is_freed():
@@ -255,7 +255,7 @@ def test_contact_stays_where_something_else_is_freed():
     vertices, faces = moved(join(box(), box(center=(0.6, 0.2, 0.1)), apart), rotation)
     vertices = vertices.astype(np.float32)
     result = untangle_mesh(vertices, faces)
-    assert result.free and result.moved
+    assert result.is_free and result.moved
     np.testing.assert_array_equal(result.vertices[16:], vertices[16:])
 
 
@@ -264,7 +264,7 @@ def test_thin_plates_keep_their_sides():
     thin = (1.0, 1.0, 0.02)
     vertices, faces = join(box(thin), box(thin, (0.2, 0.1, 0.004)))
     result = untangle_mesh(vertices, faces)
-    assert result.free and result.flipped_triangles == 0
+    assert result.is_free and result.flipped_triangles == 0
     for plate in (faces[:12], faces[12:]):
         assert signed_volume(result.vertices, plate) == pytest.approx(0.02, rel=0.1)
     assert result.largest_displacement < 0.1
@@ -320,7 +320,7 @@ def test_a_step_into_nothing_ends_the_attempt(monkeypatch):
         _Search, "move", lambda self, place, *_: np.full(place.vertices.shape, np.nan)
     )
     result = untangle_mesh(vertices, faces)
-    assert result.vertices.tobytes() == vertices.tobytes() and not result.free
+    assert result.vertices.tobytes() == vertices.tobytes() and not result.is_free
     assert result.result == RESULTS.nonlinear_divergence and "diverged" in result.reason
 
 
@@ -329,7 +329,7 @@ def test_double_precision_far_from_the_origin():
     offset = np.array([4e6, -3e5, 1234.5])
     far = vertices + offset
     near, result = untangle_mesh(vertices, faces), untangle_mesh(far, faces)
-    assert result.free and result.vertices.dtype == np.float64
+    assert result.is_free and result.vertices.dtype == np.float64
     assert result.largest_displacement == pytest.approx(near.largest_displacement, rel=1e-3)
     assert not intersects(result.vertices - offset, faces)
 
@@ -399,7 +399,10 @@ def test_a_mesh_file_is_freed_in_its_own_format(suffix, tmp_path, capsys):
     assert main([*words, "--meshes"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report == json.loads((out / "report.json").read_text())
-    assert report["free"] and report["before"]["crossings"] > 0 == report["after"]["crossings"]
+    assert (
+        report["is_free"]
+        and report["before"]["intersecting_pairs"] > 0 == report["after"]["intersecting_pairs"]
+    )
     assert report["mesh"] == f"pair_untangled{suffix}"
     assert report["meshes"] == ["pair_before.glb", "pair_after.glb"]
     assert all((out / name).exists() for name in report["meshes"])
@@ -420,10 +423,10 @@ def test_a_mesh_file_that_does_not_come_free_says_so(tmp_path, capsys, monkeypat
     trimesh.Trimesh(*SHAPES["a tube that enters itself"], process=False).export(file)
     assert main(["untangle", str(file), "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
-    assert "not free: " in captured.err and "pairs of triangles are left" in captured.err
+    assert "not intersection-free: " in captured.err and "pairs are left" in captured.err
     assert "largest displacement" in captured.out and "triangles turned over" in captured.out
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert not report["free"] and "number of steps" in report["reason"]
+    assert not report["is_free"] and "number of steps" in report["reason"]
     nested = join(sphere(subdivisions=2), sphere(0.5, subdivisions=1))
     trimesh.Trimesh(*nested, process=False).export(file)
     assert main(["untangle", str(file), "--out", str(tmp_path / "out")]) == 1
@@ -474,7 +477,7 @@ def test_a_mesh_file_far_from_the_origin_is_not_rounded(suffix, tmp_path, capsys
     assert main(["untangle", str(file), "--out", str(out)]) == 0
     report = json.loads((out / "report.json").read_text())
     written = ".ply" if suffix in (".stl", ".glb") else suffix
-    assert report["mesh"] == f"pair_untangled{written}" and report["free"]
+    assert report["mesh"] == f"pair_untangled{written}" and report["is_free"]
     assert ("single precision" in capsys.readouterr().err) == (suffix != written)
     after, triangles = read_mesh(out / report["mesh"])
     assert np.array_equal(triangles, corners) and not intersects(after - offset, triangles)

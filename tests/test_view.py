@@ -108,7 +108,7 @@ def test_a_reading_is_the_report(paper, count_folds):
     )
     reading = scene.read()
     assert reading.volume == report.volume > 0
-    assert reading.crossing_pairs == report.crossing_pairs[0]
+    assert reading.intersecting_pairs == report.intersecting_pairs
     assert (reading.counts.penetrating, reading.counts.inverted) == (
         report.num_penetrating,
         report.num_inverted,
@@ -167,7 +167,7 @@ def test_a_mesh_comes_free_as_untangle_mesh_says(pair_file):
     expected = untangle_mesh(scene.vertices, scene.faces)
     shown = []
     untangle_scene(scene, lambda vertices, text: shown.append(vertices), lambda: False)
-    assert expected.free and expected.before.volume > 0 == scene.read().volume
+    assert expected.is_free and expected.before.volume > 0 == scene.read().volume
     np.testing.assert_array_equal(scene.vertices, expected.vertices)
     assert len(shown) >= 2
     scene.reset()
@@ -188,8 +188,8 @@ def test_figures_say_what_was_measured(balls, pair_file):
 def test_what_cannot_be_measured_is_said_and_is_not_free(balls, pair_file):
     balls.set_pose(np.full((24, 3), np.nan))
     reading = balls.read()
-    assert reading.error.startswith("vertices must be finite") and not reading.free
-    assert np.isnan(reading.volume) and not reading.labels.any() and reading.crossing_pairs == 0
+    assert reading.error.startswith("vertices must be finite") and not reading.is_free
+    assert np.isnan(reading.volume) and not reading.labels.any() and reading.intersecting_pairs == 0
     text = figures(reading, balls, reading.error)
     assert "not measured" in text and "vertices must be finite" in text and ">nan" not in text
     with pytest.raises(ValueError, match="pose must be finite"):
@@ -210,7 +210,7 @@ def test_a_mesh_far_from_the_origin_is_not_rounded(tmp_path):
     near = intersection_report(vertices, faces)
     assert scene.read().volume == pytest.approx(near.volume, rel=1e-6)
     untangle_scene(scene, lambda vertices, text: None, lambda: False)
-    assert scene.read().free and scene.vertices.dtype == np.float64
+    assert scene.read().is_free and scene.vertices.dtype == np.float64
     assert np.abs(scene.vertices - offset - vertices).max() < 0.2
 
 
@@ -380,7 +380,7 @@ def test_a_view_serves_on_this_machine_alone_and_a_bad_file_changes_nothing(
         view._do("open", "open_upload", "pair.ply", pair_file.read_bytes())
         view._do("untangle", "untangle")
         assert view.worker.wait_until_idle(30)
-        assert view.scene.body is None and view._status == "free"
+        assert view.scene.body is None and view._status == "intersection-free"
         kept = view.scene.vertices
         view.scene.set_free_vertices(np.full_like(kept, np.inf))
         view._do("through", "see_through", False)

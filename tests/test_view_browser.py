@@ -127,9 +127,10 @@ def test_a_joint_bent_in_the_browser_comes_free(page, tmp_path):
     )
     page.get_by_role("button", name="Untangle").click()
     page.wait_for_function(
-        "/^(free|not free|That)/.test(document.querySelector('#spt-figures').dataset.status)"
+        "/^(intersection-free|not inters|That)/"
+        ".test(document.querySelector('#spt-figures').dataset.status)"
     )
-    assert page.get_attribute("#spt-figures", "data-status") == "free"
+    assert page.get_attribute("#spt-figures", "data-status") == "intersection-free"
     assert volume(page) == 0
     assert page.inner_text("#spt-figures").startswith("0.00 cm³")
     steps = {at for status, at in page.evaluate("seen") if "step" in status}

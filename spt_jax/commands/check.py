@@ -89,7 +89,7 @@ def _judge(
     found["intersection"] = report.as_dict()
     verdict = (
         "[red]it self-intersects[/red]"
-        if report.intersects
+        if not report.is_free
         else "[green]it does not self-intersect[/green]"
     )
     if rays is None and not report.exact:
@@ -97,4 +97,4 @@ def _judge(
             "the exact sums do not close on this mesh, so rays were cast and the volume is as good "
             "as they are; please report the file"
         )
-    return int(report.intersects), [checked, report, verdict]
+    return int(not report.is_free), [checked, report, verdict]

@@ -124,7 +124,7 @@ def people_table(people: Sequence[Fitted]) -> "Table":
     width = max((len(word) for word in words), default=0)
     table.add_column("status", overflow="fold", min_width=width)
     headings = ("points\nseen", "error, px\nmedian", "\nlargest", "distance\nm", "overlap\ncm³")
-    for heading in (*headings, "crossings"):
+    for heading in (*headings, "pairs"):
         table.add_column(heading, justify="right", no_wrap=True)
     for one in people:
         if one.overlap is None:
@@ -139,7 +139,7 @@ def people_table(people: Sequence[Fitted]) -> "Table":
             f"{one.errors.max():.1f}",
             f"{one.distance:.2f}",
             f"[{colour}]{one.overlap.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
-            f"[{colour}]{one.overlap.crossing_pairs[0]}[/{colour}]",
+            f"[{colour}]{one.overlap.intersecting_pairs}[/{colour}]",
         )
     return table
 
@@ -169,7 +169,8 @@ def scene_lines(scenes: Sequence[dict[str, Any]]) -> list[str]:
         f"{scene['image']}: {len(scene['people'])} people together, between them "
         f"{scene['before']['volume_between'] * _CUBIC_CENTIMETRES:.2f} -> "
         f"{scene['after']['volume_between'] * _CUBIC_CENTIMETRES:.2f} cm³, "
-        f"{scene['before']['crossings_between']} -> {scene['after']['crossings_between']} crossings"
+        f"{scene['before']['intersecting_pairs_between']} -> "
+        f"{scene['after']['intersecting_pairs_between']} intersecting pairs"
         for scene in scenes
     ]
 

@@ -148,10 +148,10 @@ def fit_everyone(
 
 def _penetration_report(found: "Penetration") -> dict[str, float | int]:
     return {
-        "volume_between": float(found.between),
-        "volume_within": float(found.within),
-        "crossings_between": int(found.crossings_between),
-        "crossings_within": int(found.crossings_within),
+        "volume_between": float(found.volume_between),
+        "volume_within": float(found.volume_within),
+        "intersecting_pairs_between": int(found.intersecting_pairs_between),
+        "intersecting_pairs_within": int(found.intersecting_pairs_within),
     }
 
 

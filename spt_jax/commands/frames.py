@@ -46,7 +46,7 @@ class Frame:
     after: "IntersectionReport"
     steps: int
     seconds: float
-    free: bool
+    is_free: bool
     reason: str
 
     @property
@@ -131,7 +131,7 @@ def untangle_frames(
                 after=after,
                 steps=int(result.steps),
                 seconds=time.perf_counter() - start,
-                free=bool(result.free),
+                is_free=bool(result.is_free),
                 reason=result.reason,
             )
         )
@@ -170,8 +170,8 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
             f"[{colour}]{frame.after.ratio:.2%}[/{colour}]",
             f"{frame.before.volume * _CUBIC_CENTIMETRES:.2f}",
             f"[{colour}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
-            str(frame.before.crossing_pairs[0]),
-            f"[{colour}]{frame.after.crossing_pairs[0]}[/{colour}]",
+            str(frame.before.intersecting_pairs),
+            f"[{colour}]{frame.after.intersecting_pairs}[/{colour}]",
             str(frame.steps),
             f"{frame.seconds:.1f} s",
         )
@@ -186,12 +186,12 @@ def summary(frames: Sequence[Frame]) -> str:
     )
     change = f" ({after / before - 1:+.2%})" if before else ""
     count = "1 frame" if len(frames) == 1 else f"{len(frames)} frames"
-    pairs = sum(frame.after.crossing_pairs[0] for frame in frames)
-    free = sum(frame.free for frame in frames)
-    left = f"; {pairs} pairs of triangles still intersect" if pairs else "; no triangles intersect"
+    pairs = sum(frame.after.intersecting_pairs for frame in frames)
+    free = sum(frame.is_free for frame in frames)
+    left = f"; {pairs} intersecting pairs left" if pairs else "; no intersecting pairs left"
     return (
-        f"{count}, {free} free: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after{change}"
-        f"{left}"
+        f"{count}, {free} collision-free: {before:.2f} cm³ of overlap before, {after:.2f} cm³ after"
+        f"{change}{left}"
     )
 
 
@@ -205,10 +205,12 @@ def left_out(before: Iterable["IntersectionReport"], after: Iterable["Intersecti
     for when, reports in (("before", list(before)), ("after", list(after))):
         if reports:
             volume = sum(report.total_volume - report.volume for report in reports)
-            pairs = sum(report.crossing_pairs[1] - report.crossing_pairs[0] for report in reports)
-            parts.append((f"{volume * _CUBIC_CENTIMETRES:.2f} cm³ and {pairs} pairs", when))
+            pairs = sum(r.total_intersecting_pairs - r.intersecting_pairs for r in reports)
+            parts.append(
+                (f"{volume * _CUBIC_CENTIMETRES:.2f} cm³ and {pairs} intersecting pairs", when)
+            )
     if len(parts) == 1:
-        return f"left out as folds: {parts[0][0]} of triangles"
+        return f"left out as folds: {parts[0][0]}"
     return "left out as folds: " + ", ".join(f"{what} {when}" for what, when in parts)
 
 
@@ -224,7 +226,7 @@ def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -
                 "name": frame.name,
                 "before": frame.before.as_dict(),
                 "after": frame.after.as_dict(),
-                "free": frame.free,
+                "is_free": frame.is_free,
                 "reason": frame.reason,
                 "steps": frame.steps,
                 "seconds": round(frame.seconds, 3),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _FACTS = "facts"
 _WHEN = ("before", "after")
-_FRAME_FACTS = ("name", "steps", "seconds", "free", "reason")
+_FRAME_FACTS = ("name", "steps", "seconds", "is_free", "reason")
 _PERSON_ARRAYS = ("pose", "shape", "translation", "vertices", "keypoints")
 _PERSON_FACTS = ("distance", "terms", "status", "reason", "steps", "seconds")
 

@@ -1,4 +1,4 @@
-"""`spt-jax untangle MESH`: one mesh file freed by its vertices, and what is written of it."""
+"""`spt-jax untangle MESH`: one mesh file made intersection-free by moving its vertices."""
 
 import json as json_format
 import time
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from spt_jax.untangle.mesh import UntangleMeshResult
 
 # Text formats keep every digit, and .ply holds either precision; .glb and .stl hold float32, so the
-# mesh must be free in float32.
+# mesh must be intersection-free in float32.
 _TEXT = (".obj", ".off")
 _SINGLE = (".glb", ".stl")
 _KNOWN = (*_TEXT, *_SINGLE, ".ply")
@@ -39,7 +39,7 @@ def untangle_mesh_file(
     json: bool,
     quiet: bool,
 ) -> int:
-    """Free one mesh; the exit code is 0 if it is free, and 1 otherwise."""
+    """Untangle one mesh; the exit code is 0 if it is intersection-free, and 1 otherwise."""
     from spt_jax.arguments import as_rays
     from spt_jax.mesh_check import check_mesh
     from spt_jax.mesh_files import open_mesh
@@ -94,23 +94,23 @@ def untangle_mesh_file(
         console.print(_table(result, seconds))
         also = "".join(f", {name}" for name in report["meshes"])
         show(console, f"in {folder}: {report['mesh']}, report.json{also}")
-    if result.after.crossings:
+    if result.after.intersecting_pairs:
         show(
             err_console(quiet),
-            f"not free: {result.after.crossings} of {result.before.crossings} intersecting pairs "
-            "of triangles are left; part the pieces by hand where they are deepest, or refine the "
-            "mesh there",
+            f"not intersection-free: {result.after.intersecting_pairs} of "
+            f"{result.before.intersecting_pairs} intersecting pairs are left; part the pieces by "
+            "hand where they are deepest, or refine the mesh there",
             "red",
         )
-    elif not result.free:
+    elif not result.is_free:
         show(
             err_console(quiet),
-            f"not free: nothing intersects, but {result.after.volume:.4g} units³ of overlap are "
-            "left; a part that lies within another whole, or on a copy of its own, is not pushed "
-            "out: move it by hand, or take it out",
+            f"not intersection-free: no faces intersect, but {result.after.volume:.4g} units³ of "
+            "overlap are left; a part enclosed in another, or lying on a copy of its own, is not "
+            "pushed out: move it by hand, or take it out",
             "red",
         )
-    return 0 if result.free else 1
+    return 0 if result.is_free else 1
 
 
 def _as_stored(
@@ -145,9 +145,9 @@ def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
     for heading in ("", "before", "after"):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     before, after = result.before, result.after
-    colour = "green" if result.free else "red"
-    left = f"[{colour}]{after.crossings}[/{colour}]"
-    table.add_row("intersecting pairs", f"{before.crossings}", left)
+    colour = "green" if result.is_free else "red"
+    left = f"[{colour}]{after.intersecting_pairs}[/{colour}]"
+    table.add_row("intersecting pairs", f"{before.intersecting_pairs}", left)
     table.add_row("overlap, units³", f"{before.volume:.4g}", f"{after.volume:.4g}")
     table.add_row("vertices in overlap", f"{before.ratio:.2%}", f"{after.ratio:.2%}")
     table.add_row("vertices moved", "", f"{result.moved}")

@@ -16,7 +16,7 @@ def view(
     max_bytes: int | None = None,
     quiet: bool = False,
 ) -> int:
-    """Look at a body or a mesh in the browser, bend it, and watch it come free.
+    """Look at a body or a mesh in the browser, bend it, and watch it being untangled.
 
     Joints turn by sliders or by rings in the picture; vertices in self-intersection are coloured,
     and volume, ratio and milliseconds are shown as you drag. Ends with Ctrl-C.

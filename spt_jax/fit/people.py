@@ -27,22 +27,23 @@ from spt_jax.overlap.measure import Unmeasurable
 from spt_jax.report import intersection_report
 from spt_jax.rest_surface import RestSurface
 
-# What is tried where people still cross: the margin, times this, with the last weight again.
+# What is tried where people still intersect: the margin, times this, with the last weight again.
 _WIDER = (2.0, 4.0, 8.0)
 
 
 class Penetration(eqx.Module):
-    """How far people are in each other and in themselves, the folds of skin aside.
+    """How deep people are in each other and in themselves, folds of the skin left out.
 
     Attributes:
-        between, within: overlap volumes, in m^3; NaN where a body is none that could be measured.
-        crossings_between, crossings_within: pairs of triangles that intersect; -1 in that case.
+        volume_between, volume_within: overlap volumes, in m^3; NaN if a body cannot be measured.
+        intersecting_pairs_between, intersecting_pairs_within: numbers of face pairs that intersect;
+            -1 if a body cannot be measured.
     """
 
-    between: Float[Array, ""]
-    within: Float[Array, ""]
-    crossings_between: Int[Array, ""]
-    crossings_within: Int[Array, ""]
+    volume_between: Float[Array, ""]
+    volume_within: Float[Array, ""]
+    intersecting_pairs_between: Int[Array, ""]
+    intersecting_pairs_within: Int[Array, ""]
 
 
 class PeopleResult(eqx.Module):
@@ -73,11 +74,11 @@ def fit_people(
     max_steps: int = 25,
     **options: Any,
 ) -> PeopleResult:
-    """People who share a scene, fitted so that they pass neither through each other nor themselves.
+    """People who share a scene, fitted so that they intersect neither each other nor themselves.
 
     Each is fitted alone by `fit_pose`; then all of their parameters together minimise the sum of
     their objectives and the overlap of the whole scene, between and within people, its weight
-    rising. Where triangles of two people, or of two parts of one, still cross, the last weight is
+    rising. Where faces of two people, or of two parts of one, still intersect, the last weight is
     tried again with two, four and eight times the margin.
 
     Args:
@@ -94,8 +95,8 @@ def fit_people(
             each person is fitted with alone.
 
     Returns:
-        PeopleResult. Of all stages the one with the fewest crossings between people, then within,
-        then the least overlap, is kept.
+        PeopleResult. Of all stages it keeps the one with the fewest intersecting pairs between
+        people, then within, then the least overlap.
 
     Raises:
         TypeError, ValueError: as `fit_pose`; keypoints of another shape; an unknown option.
@@ -111,7 +112,7 @@ def fit_people(
         >>> apart = jnp.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
         >>> seen = camera.project(body(turned, translation=apart).joints[:, :22])
         >>> fit = fit_people(body, seen, camera, layout=body.joint_names[:22])
-        >>> int(fit.after.crossings_between)
+        >>> int(fit.after.intersecting_pairs_between)
         0
     """
     known = inspect.signature(fit_pose).parameters
@@ -196,13 +197,13 @@ def _penetration(body: BodyModel, fits: FitResult, rest: RestSurface) -> Penetra
         except Unmeasurable:
             nothing, none = jnp.asarray(jnp.nan, jnp.float32), jnp.asarray(-1)
             return Penetration(nothing, nothing, none, none)
-        found[name] = jnp.asarray(report.volume, jnp.float32)
-        found[f"crossings_{name}"] = jnp.asarray(report.crossing_pairs[0])
+        found[f"volume_{name}"] = jnp.asarray(report.volume, jnp.float32)
+        found[f"intersecting_pairs_{name}"] = jnp.asarray(report.intersecting_pairs)
     return Penetration(**found)
 
 
 def _rank(found: Penetration) -> tuple[int, int, float]:
-    volume = float(found.between) + float(found.within)
+    volume = float(found.volume_between) + float(found.volume_within)
     if not np.isfinite(volume):
         return np.iinfo(np.int64).max, 0, np.inf
-    return int(found.crossings_between), int(found.crossings_within), volume
+    return int(found.intersecting_pairs_between), int(found.intersecting_pairs_within), volume

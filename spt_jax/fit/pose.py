@@ -49,7 +49,7 @@ def fit_pose(
     keypoint_solver: optx.AbstractMinimiser | None = None,
     max_steps: int = 20,
 ) -> FitResult:
-    """The pose of a body whose keypoints look like those given, and which is free of itself.
+    """Find the pose of a body that matches keypoints in an image and does not intersect itself.
 
     It minimises (section 4.3 of the paper, with what is needed to make the pose a person's)
 
@@ -189,8 +189,8 @@ def _regularise(setup: Setup, person: Person, candidates: Candidates) -> FitResu
     # What was searched with a more forgiving loss costs something else with its own.
     costs = candidates.costs if objective.robust is None else jax.vmap(objective.cost)(looked)
     energies = jax.vmap(energy)(looked)
-    # The best by the keypoints, and the best that is free: what a graze costs to end is only known
-    # when both have gone through the stages.
+    # The best by the keypoints, and the best with the regulariser: what a graze costs to end is
+    # only known when both have gone through the stages.
     judged = costs + weights[-1] * energies
     tracks = jnp.stack([looked[_least(costs)], looked[_least(judged)]])
 

@@ -147,7 +147,7 @@ class ExactOverlap:
         return given
 
     @property
-    def crossing_pairs(self) -> int:
+    def intersecting_pairs(self) -> int:
         """Pairs of the triangles given that intersect and count."""
         return self.surface.count_pairs((self.pair_weights > 0) & self.surface.listed)
 

@@ -171,13 +171,13 @@ class Measurement:
         return float(np.mean([found.total_volume for found in self.beams]))
 
     @property
-    def crossing_pairs(self) -> int:
-        """Pairs of triangles that intersect and count."""
-        return self.overlap.crossing_pairs
+    def intersecting_pairs(self) -> int:
+        """The number of face pairs that intersect and count."""
+        return self.overlap.intersecting_pairs
 
     @property
-    def total_crossing_pairs(self) -> int:
-        """Pairs of triangles that intersect."""
+    def total_intersecting_pairs(self) -> int:
+        """The number of face pairs that intersect."""
         return self.surface.count_pairs(self.surface.listed)
 
     def labels(self, rule: Rule) -> Int[np.ndarray, "V"]:

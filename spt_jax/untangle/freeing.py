@@ -94,7 +94,7 @@ class Place:
     @property
     def pairs(self) -> int:
         """Pairs of triangles that intersect; contact is none."""
-        return self.found.total_crossing_pairs
+        return self.found.total_intersecting_pairs
 
     @cached_property
     def volume(self) -> float:

@@ -1,4 +1,4 @@
-"""Freeing any closed mesh of its self-intersections by moving its vertices."""
+"""Remove any closed mesh's self-intersections by moving its vertices."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -24,13 +24,13 @@ class MeshOverlap:
 
     Attributes:
         volume: the overlap volume, in the cube of the mesh's unit.
-        ratio: the part of the vertices in it (paper, Eq. 11).
-        crossings: pairs of triangles that intersect; those that only touch do not.
+        ratio: the fraction of the vertices in it (paper, Eq. 11).
+        intersecting_pairs: the number of face pairs that intersect; faces that only touch do not.
     """
 
     volume: float
     ratio: float
-    crossings: int
+    intersecting_pairs: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class UntangleMeshResult:
         >>> ball = trimesh.creation.icosphere(subdivisions=2)
         >>> pair = trimesh.util.concatenate(ball, ball.copy().apply_translation([1.8, 0.1, 0.2]))
         >>> found = untangle_mesh(pair.vertices, pair.faces)
-        >>> found.free, found.before.crossings > 0, found.largest_displacement < 0.2
+        >>> found.is_free, found.before.intersecting_pairs > 0, found.largest_displacement < 0.2
         (True, True, True)
     """
 
@@ -73,19 +73,19 @@ class UntangleMeshResult:
     result: RESULTS
 
     @property
-    def free(self) -> bool:
+    def is_free(self) -> bool:
         """Whether no triangles intersect, nothing overlaps, and no part was turned inside out."""
         return bool(self.result == RESULTS.successful)
 
     @property
     def reason(self) -> str:
         """The result in words."""
-        return in_words(self.result)
+        return in_words(self.result, "intersection-free")
 
     def as_dict(self) -> dict[str, Any]:
         """All but the vertices, for JSON."""
         return {
-            "free": self.free,
+            "is_free": self.is_free,
             "reason": self.reason,
             "before": asdict(self.before),
             "after": asdict(self.after),
@@ -124,7 +124,7 @@ def untangle_mesh(
     intersection contour minimization"). Where an attempt leaves intersections, the next starts anew
     with twice the s there; where none leaves nothing, connected parts that intersect each other are
     pushed apart as they are. At the end the displacement of each part is scaled down as far as the
-    mesh stays free, and vertices to which it has all but faded go back.
+    mesh stays intersection-free, and vertices to which it has all but faded go back.
 
     Every place that the search comes by is measured exactly. It is taken only where it has neither
     more intersecting pairs nor more overlap than the mesh given, and where no connected part is
@@ -133,14 +133,14 @@ def untangle_mesh(
 
     Contact is no intersection: solids that touch, and flat faces that lie on each other, stay as
     they are. A part that lies within another whole, or upon a copy of its own, overlaps it but
-    intersects nothing; it is left there and told: `free` is False then.
+    intersects nothing; it is left there, and `is_free` is False.
 
     Args:
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
             must be closed and consistently wound; it need not be connected.
         rays: as in `self_intersection_penalty`, for the gradient that the search follows; what is
-            compared and told is exact in any case.
+            compared and reported is exact in any case.
         directions: as in `self_intersection_penalty`.
         attempts: at most so many, each from the vertices given.
         steps_per_attempt: at most so many steps in each attempt.
@@ -148,7 +148,8 @@ def untangle_mesh(
             number of pairs of triangles that are to be parted.
 
     Returns:
-        The first attempt's vertices that are free, else the best that were seen: look at `free`. A
+        The vertices of the first attempt that is intersection-free, else the best ones found: see
+        `is_free`. A
         mesh without intersections comes back to the bit, and so do vertices far from any.
 
     Raises:
@@ -166,7 +167,7 @@ def untangle_mesh(
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
         >>> pair = trimesh.util.concatenate(ball, ball.copy().apply_translation([1.8, 0.0, 0.0]))
         >>> result = untangle_mesh(np.asarray(pair.vertices), pair.faces)
-        >>> result.free, bool(result.largest_displacement < 0.15)
+        >>> result.is_free, bool(result.largest_displacement < 0.15)
         (True, True)
     """
     if isinstance(vertices, Tracer) or isinstance(faces, Tracer):
@@ -260,5 +261,5 @@ def _flipped(before, after, surface: Surface) -> int:
     return int(np.count_nonzero(dot(first, second) < 0))
 
 
-def _nothing(attempt: int, steps: int, crossings: int) -> None:
+def _nothing(attempt: int, steps: int, pairs: int) -> None:
     pass

@@ -1,4 +1,4 @@
-"""Freeing a posed body of its self-intersections by moving its joints."""
+"""Remove a posed body's self-intersections by moving its joints."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -38,7 +38,7 @@ _STIFFNESS = 1e-3
 
 _CENTIMETRE = 0.01
 
-# What is tried where the weights did not free a pose: the margin, times this, with the last weights
+# What is tried where the weights left collisions: the margin, times this, with the last weights
 # again from where the last attempt ended.
 _WIDER = (2.0, 4.0)
 _AGAIN = 2
@@ -53,16 +53,17 @@ class Overlap(eqx.Module):
     Attributes:
         volume: the overlap volume that counts, in m^3: without folds, unless they count.
         total_volume: the same with folds.
-        ratio: the part of the vertices in overlaps that count (paper, Eq. 11).
-        crossings: pairs of triangles that intersect and count; those that only touch do not.
-        total_crossings: the same with folds.
+        ratio: the fraction of the vertices in overlaps that count (paper, Eq. 11).
+        intersecting_pairs: the number of face pairs that intersect and count; faces that only
+            touch do not intersect.
+        total_intersecting_pairs: the same with folds.
     """
 
     volume: Float[Array, "*batch"]
     total_volume: Float[Array, "*batch"]
     ratio: Float[Array, "*batch"]
-    crossings: Int[Array, "*batch"]
-    total_crossings: Int[Array, "*batch"]
+    intersecting_pairs: Int[Array, "*batch"]
+    total_intersecting_pairs: Int[Array, "*batch"]
 
 
 class UntangleResult(eqx.Module):
@@ -84,14 +85,14 @@ class UntangleResult(eqx.Module):
     result: RESULTS
 
     @property
-    def free(self) -> Bool[Array, "*batch"]:
-        """Whether nothing collides any more; with folds="remove", whether nothing intersects."""
+    def is_free(self) -> Bool[Array, "*batch"]:
+        """Whether no parts collide any more; with folds="remove", whether no faces intersect."""
         return self.result == RESULTS.successful
 
     @property
     def reason(self) -> Any:
         """The result in words: a string, or nested lists of strings over the batch axes."""
-        return in_words(self.result)
+        return in_words(self.result, "collision-free")
 
 
 def untangle_pose(
@@ -117,11 +118,11 @@ def untangle_pose(
 
         (rms vertex displacement / cm)^2 + weight * (overlap volume / cm^3)
 
-    from where the last one stopped, until no two parts of the surface cross; the displacement is
-    that of the body's linearisation at the pose given, which makes its term a plain sum of squares
-    in the solver's variables. All joints move but the root: turning the whole body frees nothing.
-    The overlap is that of the surface moved outwards by half of `margin`. Where the weights do not
-    free the pose, the last ones are tried again with two and four times the margin.
+    from where the last one stopped, until no two parts of the surface intersect; the displacement
+    is that of the body's linearisation at the pose given, which makes its term a plain sum of
+    squares in the solver's variables. All joints move but the root: turning the whole body frees
+    nothing. The overlap is that of the surface moved outwards by half of `margin`. Where the
+    weights leave collisions, the last ones are tried again with two and four times the margin.
 
     Args:
         body: any `BodyModel`.
@@ -132,7 +133,7 @@ def untangle_pose(
             the creases that skinning makes at armpits, elbows and groins. "ignore": they are left
             as they are, and a pose that has only those comes back unchanged. "remove": the pose
             is freed of collisions, then `untangle_mesh` moves the vertices until the surface
-            crosses itself nowhere. "count": they are no different from collisions; the pose has
+            intersects itself nowhere. "count": they are no different from collisions; the pose has
             to open them, at the price of a visible change, and no margin is kept.
         fold_distance: how near to each other, along the rest surface and in metres, sheets are
             folds; everywhere the same. None: `body.rest_surface` says, place by place.
@@ -142,18 +143,19 @@ def untangle_pose(
         directions: as in `self_intersection_penalty`.
         weights: rising weights of the overlap.
         steps_per_weight: most steps of the solver for each weight.
-        tolerance: an overlap of this volume or less, in m^3, is none where nothing crosses; the
-            default is 1 mm^3.
+        tolerance: an overlap of this volume or less, in m^3, counts as none where no faces
+            intersect; the default is 1 mm^3.
         solver: an optimistix minimiser; BFGS by default.
         on_step: called with the index of the weight, the steps so far and the overlap volume that
             counts whenever a weight is done.
 
     Returns:
-        The pose with the fewest crossings, and of those the least overlap, of those measured after
-        each weight, never worse than the one given; a pose in which nothing collides comes back
-        unchanged. `result` says how it ended, `free` whether it did well. Where the solver runs
-        away, to numbers that are not finite or to joints turned by more than a full turn, that
-        place is not taken, and the next weight starts from the last one that could be measured.
+        The pose with the fewest intersecting pairs, and of those the least overlap, among those
+        measured after each weight, never worse than the one given; a pose in which nothing collides
+        comes back unchanged. `result` says how it ended, `is_free` whether nothing collides any
+        more. Where the solver runs away, to numbers that are not finite or to joints turned by more
+        than a full turn, that place is not taken, and the next weight starts from the last one that
+        could be measured.
 
     Raises:
         ValueError: pose of another shape than (..., J, 3) or with values that are not finite;
@@ -172,8 +174,10 @@ def untangle_pose(
         >>> body, mocap = load_body(), load_mocap()
         >>> pose = body.pose_from_smpl(mocap.pose[mocap.names.index("cartwheel/0103")])
         >>> result = untangle_pose(body, pose)
-        >>> int(result.before.crossings) > 0, int(result.after.crossings), result.reason
-        (True, 0, 'free')
+        >>> int(result.before.intersecting_pairs) > 0, int(result.after.intersecting_pairs)
+        (True, 0)
+        >>> result.reason
+        'collision-free'
     """
     pose = jnp.asarray(pose)
     if pose.shape[-2:] != (body.num_joints, 3):
@@ -264,18 +268,20 @@ class _Search(eqx.Module):
             volume=jnp.asarray(found.volume, dtype),
             total_volume=jnp.asarray(found.total_volume, dtype),
             ratio=jnp.asarray(np.mean(found.labels("vertex") != 0), dtype),
-            crossings=jnp.asarray(found.crossing_pairs, jnp.int32),
-            total_crossings=jnp.asarray(found.total_crossing_pairs, jnp.int32),
+            intersecting_pairs=jnp.asarray(found.intersecting_pairs, jnp.int32),
+            total_intersecting_pairs=jnp.asarray(found.total_intersecting_pairs, jnp.int32),
         )
 
     def rank(self, overlap: Overlap) -> tuple[int, float]:
         """Sorts overlaps, the best first."""
-        return (0 if self.folds == "count" else int(overlap.crossings)), float(overlap.volume)
+        return (0 if self.folds == "count" else int(overlap.intersecting_pairs)), float(
+            overlap.volume
+        )
 
     def is_free(self, overlap: Overlap) -> bool:
         """Whether there is nothing left to do."""
-        crossings, volume = self.rank(overlap)
-        return crossings == 0 and volume <= self.tolerance
+        pairs, volume = self.rank(overlap)
+        return pairs == 0 and volume <= self.tolerance
 
     def attempts(self) -> list[tuple[float, float]]:
         """Margin and weight of every descent."""
@@ -337,13 +343,13 @@ def _untangle_one(
             if search.is_free(after) or stuck:
                 break
     free = search.is_free(after)
-    if surface is not None and int(after.total_crossings):
+    if surface is not None and int(after.total_intersecting_pairs):
         sampling = Sampling(None, search.directions)
         skin = untangle_checked(np.asarray(vertices), surface, sampling)
         if skin.moved:
             vertices = jnp.asarray(skin.vertices)
             after = search.measure(vertices, body.faces)
-        free, ended = skin.free, skin.result
+        free, ended = skin.is_free, skin.result
     return UntangleResult(
         pose=best,
         vertices=vertices,

@@ -36,17 +36,17 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
-def in_words(result: Any) -> Any:
-    """A result's message; nested lists of messages over the batch axes.
+def in_words(result: Any, success: str) -> Any:
+    """A result's message, `success` for a successful one; nested lists over the batch axes.
 
     Example:
         >>> from spt_jax.untangle.results import RESULTS, in_words
-        >>> in_words(RESULTS.successful)
-        'free'
+        >>> in_words(RESULTS.successful, "collision-free")
+        'collision-free'
     """
     free = np.asarray(result == RESULTS.successful)
     words = np.empty(free.shape, object)
     for at in np.ndindex(free.shape):
         one = jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf)[at], result)
-        words[at] = RESULTS[one] or "free"
+        words[at] = RESULTS[one] or success
     return words.tolist()

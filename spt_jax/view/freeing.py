@@ -171,6 +171,9 @@ def _free_vertices(scene: Scene, show: Show, stopped: Callable[[], bool]) -> Non
         most = {} if steps is None else looks
         found = untangle_checked(vertices, surface, sampling, on_step=on_step, **most)
         scene.set_free_vertices(found.vertices)
-        show(found.vertices, f"step {found.steps}, {found.after.crossings} intersecting pairs")
-        if not found.after.crossings:
+        show(
+            found.vertices,
+            f"step {found.steps}, {found.after.intersecting_pairs} intersecting pairs",
+        )
+        if not found.after.intersecting_pairs:
             return

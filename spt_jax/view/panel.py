@@ -218,7 +218,7 @@ def figures(reading: Reading, scene: Scene, status: str) -> str:
         (small_name, small),
         (f"{_dot(PENETRATING_COLOR)} penetrating", f"{reading.counts.penetrating}"),
         (f"{_dot(INVERTED_COLOR)} inverted", f"{reading.counts.inverted}"),
-        ("triangle pairs that intersect", f"{reading.crossing_pairs}"),
+        ("intersecting pairs", f"{reading.intersecting_pairs}"),
         ("measured in", f"{reading.milliseconds:.0f} ms"),
     ]
     table = "".join(

@@ -35,7 +35,7 @@ class Reading:
         vertices: the positions that were measured.
         labels: +1 penetrating, -1 inverted, 0 clear.
         volume: the overlap volume that counts, in the cube of the vertices' unit.
-        crossing_pairs: pairs of triangles that intersect and count.
+        intersecting_pairs: the number of face pairs that intersect and count.
         milliseconds: that measuring took.
         error: why there is nothing to measure, in one line; then the volume is NaN and no vertex is
             in self-intersection. None: it was measured.
@@ -44,14 +44,14 @@ class Reading:
     vertices: Float[np.ndarray, "V 3"]
     labels: Int8[np.ndarray, "V"]
     volume: float
-    crossing_pairs: int
+    intersecting_pairs: int
     milliseconds: float
     error: str | None = None
 
     @property
-    def free(self) -> bool:
-        """Whether it was measured, no triangles intersect and nothing overlaps."""
-        return self.error is None and not self.crossing_pairs and not self.volume > 0
+    def is_free(self) -> bool:
+        """Whether it was measured, no faces intersect and no parts overlap."""
+        return self.error is None and not self.intersecting_pairs and not self.volume > 0
 
     @property
     def counts(self) -> LabelCounts:
@@ -232,7 +232,7 @@ def _read(
     error = None
     try:
         found = measure(points, faces, sampling, exclusions, rounding)
-        volume, labels, pairs = float(found.volume), found.labels(rule), found.crossing_pairs
+        volume, labels, pairs = float(found.volume), found.labels(rule), found.intersecting_pairs
     except Unmeasurable as reason:
         volume, labels, pairs = float("nan"), np.zeros(len(vertices), np.int8), 0
         error = " ".join(str(reason).split())

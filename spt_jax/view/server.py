@@ -28,7 +28,7 @@ from spt_jax.view.stage import Stage
 from spt_jax.view.uploads import UPLOAD_LIMIT, Uploads
 from spt_jax.view.worker import Worker
 
-# A fist in the belly: something to set free at first sight.
+# A fist in the belly: something to untangle at first sight.
 _FIRST = ("punch", "punch/0013")
 _ERROR_SECONDS = 15.0
 # What ends a search under way: the newest wish counts.
@@ -172,7 +172,7 @@ class View:
         self._status = "ready"
 
     def untangle(self) -> None:
-        """Set the scene free, every step shown."""
+        """Untangle the scene and show every step."""
         self._stop.clear()
         self._untangling = True
         self.panel.show_busy(True)
@@ -306,10 +306,10 @@ def _embedded_body() -> Scene:
 def _outcome(before: Reading, after: Reading) -> str:
     if after.error is not None:
         return after.error
-    if before.free:
+    if before.is_free:
         return "nothing to untangle"
-    if after.free:
-        return "free"
-    if not after.crossing_pairs:
-        return "not free: nothing intersects, but a part lies wholly within another"
-    return f"not free: {after.crossing_pairs} pairs of triangles still intersect"
+    if after.is_free:
+        return "intersection-free"
+    if not after.intersecting_pairs:
+        return "not intersection-free: no faces intersect, but a part is enclosed in another"
+    return f"not intersection-free: {after.intersecting_pairs} intersecting pairs left"

@@ -90,7 +90,7 @@ class BodySpheres(eqx.Module):
             fold_distance: in metres. Spheres nearer than this along the limbs, over the joints
                 between them, come together whenever a joint bends: the rule for folds of
                 `body.rest_surface`, here for spheres. Without it (0.0) 93 % of the mocap frames
-                whose skin is free collide, thigh with belly above all; with it 1 %.
+                whose skin does not intersect collide, thigh with belly above all; with it 1 %.
 
         Raises:
             TypeError: the body is traced.
