@@ -22,8 +22,10 @@ from spt_jax.penalty import self_intersection_penalty as self_intersection_penal
 from spt_jax.report import IntersectionReport as IntersectionReport
 from spt_jax.report import intersection_report as intersection_report
 from spt_jax.rest_surface import RestSurface as RestSurface
+from spt_jax.result import Overlap as Overlap
 
 if typing.TYPE_CHECKING:
+    from spt_jax.fit.people import Penetration as Penetration
     from spt_jax.fit.people import PeopleResult as PeopleResult
     from spt_jax.fit.people import fit_people as fit_people
     from spt_jax.fit.pose import fit_pose as fit_pose
@@ -31,6 +33,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.keypoints import KeypointRegressor as KeypointRegressor
     from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
     from spt_jax.keypoints import read_keypoints as read_keypoints
+    from spt_jax.status import RESULTS as RESULTS
     from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
     from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
     from spt_jax.untangle.pose import UntangleResult as UntangleResult
@@ -40,7 +43,9 @@ if typing.TYPE_CHECKING:
 _LATER = {
     "FitResult": "spt_jax.fit.result",
     "KeypointRegressor": "spt_jax.keypoints",
+    "Penetration": "spt_jax.fit.people",
     "PeopleResult": "spt_jax.fit.people",
+    "RESULTS": "spt_jax.status",
     "UntangleMeshResult": "spt_jax.untangle.mesh",
     "UntangleResult": "spt_jax.untangle.pose",
     "fit_people": "spt_jax.fit.people",

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int8, Integer
@@ -25,9 +24,10 @@ from spt_jax.overlap.labels import CLEAR, INVERTED, PENETRATING
 from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
+from spt_jax.result import Result, plain
 
 
-class VertexLabels(eqx.Module):
+class VertexLabels(Result):
     """Whether each vertex penetrates another part, is inverted, or is clear.
 
     Attributes:
@@ -66,6 +66,15 @@ class VertexLabels(eqx.Module):
     def ratio(self) -> Float[Array, "*batch"]:
         """The fraction of the vertices in self-intersection (paper, Eq. 11)."""
         return jnp.mean(jnp.where(self.clear, 0.0, 1.0), axis=-1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The number of vertices with each label, and the ratio, as JSON types."""
+        return {
+            "num_penetrating": plain(self.penetrating.sum(axis=-1)),
+            "num_inverted": plain(self.inverted.sum(axis=-1)),
+            "num_clear": plain(self.clear.sum(axis=-1)),
+            "ratio": plain(self.ratio),
+        }
 
 
 def classify_vertices(

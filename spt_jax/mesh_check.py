@@ -1,7 +1,7 @@
 """Whether a mesh is one that the penalty can judge: closed, consistently wound, right side out."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,10 @@ class MeshCheck:
                 "mesh must be closed, consistently wound and right side out: got "
                 + "; ".join(self.problems)
             )
+
+    def as_dict(self) -> dict[str, Any]:
+        """All counts, problems and warnings, and whether the mesh is `ok`, as JSON types."""
+        return {"ok": self.ok, **asdict(self)}
 
     def __str__(self) -> str:
         return "\n".join([self._headline(), *(f"  {mark} {text}" for mark, text in self._lines())])

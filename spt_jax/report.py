@@ -1,6 +1,5 @@
 """The intersection report: what the penalty sees on one mesh, for people and for files."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,10 @@ from spt_jax.overlap.labels import count_labels
 from spt_jax.overlap.measure import Rule, Sampling, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
+from spt_jax.result import Result
 
 
-@dataclass(frozen=True, eq=False)
-class IntersectionReport:
+class IntersectionReport(Result):
     """How much of a mesh is in self-intersection; printing it shows a table.
 
     Attributes:
@@ -109,14 +108,6 @@ class IntersectionReport:
                 )
             ],
         }
-
-    def __str__(self) -> str:
-        from rich.console import Console
-
-        console = Console(width=88, color_system=None, force_terminal=False, force_jupyter=False)
-        with console.capture() as capture:
-            console.print(self)
-        return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
 
     def __rich__(self):
         from rich.table import Table

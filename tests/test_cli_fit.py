@@ -13,6 +13,7 @@ from helpers_body import synthetic_smpl
 from PIL import Image
 from rich.console import Console
 
+from spt_jax import RESULTS
 from spt_jax.body import load_body
 from spt_jax.body.pose_files import read_poses
 from spt_jax.cli import main
@@ -21,10 +22,11 @@ from spt_jax.commands.annotated import read_camera, select_people
 from spt_jax.commands.fitting import scenes_of
 from spt_jax.fit import pose as fitting
 from spt_jax.fit.people import Penetration, PeopleResult
-from spt_jax.fit.result import _REASONS, FitResult
+from spt_jax.fit.result import FitResult
 from spt_jax.keypoints import LAYOUTS
 from spt_jax.report import IntersectionReport
 from spt_jax.show.overlay import read_image
+from spt_jax.status import OUTSIDE
 
 COCO = LAYOUTS["coco17"]
 
@@ -48,7 +50,7 @@ def calls(monkeypatch):
             keypoints=keypoints + jnp.array([[3.0, 0.0]]),
             steps=jnp.array(7),
             terms={"reprojection": jnp.sum(confidence), "total": jnp.sum(confidence)},
-            status=jnp.array(0),
+            status=RESULTS.successful,
         )
 
     monkeypatch.setattr("spt_jax.fit.pose.fit_pose", stand_in)
@@ -317,7 +319,7 @@ def test_somebody_who_cannot_be_fitted_is_named(tmp_path, rng, monkeypatch, caps
         bad = options["confidence"][0] == 0
         vertices = jnp.where(bad, jnp.nan, found.vertices)
         terms = {"total": jnp.where(bad, jnp.nan, 1.0)}
-        status = jnp.where(bad, 2, 1)
+        status = RESULTS.not_finite if bad else RESULTS.nonlinear_max_steps_reached
         return FitResult(**(vars(found) | dict(vertices=vertices, terms=terms, status=status)))
 
     monkeypatch.setattr("spt_jax.fit.pose.fit_pose", loses_the_second)
@@ -456,7 +458,9 @@ def test_a_focal_length_in_millimetres_ends_with_1(calls, tmp_path, rng, monkeyp
     said = "000000000001/0: focal length outside any photograph: what is seen is more than 70"
     assert said in captured.err and "focal length" in captured.out
     (one,) = json.loads((out / "report.json").read_text())["people"]
-    assert one["status"] == 6 and one["reason"].startswith("focal length outside any photograph")
+    assert one["status"] == "outside_focal_length" and one["reason"].startswith(
+        "focal length outside any photograph"
+    )
 
 
 def test_what_a_file_has_and_is_not_used_is_said(calls, tmp_path, rng, monkeypatch, capsys):
@@ -475,11 +479,16 @@ def test_what_a_file_has_and_is_not_used_is_said(calls, tmp_path, rng, monkeypat
 
 
 @pytest.mark.parametrize("width", [72, 80, 120])
-@pytest.mark.parametrize("code", range(7))
-def test_the_status_is_never_cut_away(code, width):
-    reason = _REASONS[code]
+@pytest.mark.parametrize("status", ["not_finite", "unseen", *OUTSIDE])
+def test_the_status_is_never_cut_away(status, width):
+    reason = RESULTS[getattr(RESULTS, status)]
     given = {"name": "a_long_name_of_a_photograph_0123456789/12", "errors": np.full(17, 123.4)}
-    given |= {"distance": 123.45, "overlap": no_overlap([]), "outside": code > 3, "reason": reason}
+    given |= {
+        "distance": 123.45,
+        "overlap": no_overlap([]),
+        "outside": status in OUTSIDE,
+        "reason": reason,
+    }
     people = [SimpleNamespace(**given), SimpleNamespace(**given | {"overlap": None})]
     console = Console(width=width, record=True, file=io.StringIO())
     console.print(fitted.people_table(people))

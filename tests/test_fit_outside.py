@@ -7,10 +7,12 @@ import pytest
 from helpers import embedded_body
 from helpers_fit import camera, frames, objective, seen
 
-from spt_jax import PinholeCamera
+from spt_jax import RESULTS, PinholeCamera
+from spt_jax.fit import photograph
 from spt_jax.fit.figure import Variables
-from spt_jax.fit.photograph import DISTANCE, FOCAL, REASONS, SIZE, is_too_wide, outside_photographs
+from spt_jax.fit.photograph import DISTANCE, FOCAL, SIZE, is_too_wide, outside_photographs
 from spt_jax.fit.result import FitResult
+from spt_jax.status import OUTSIDE, names_of
 
 POSE = frames("walk/0010")[0]
 ONES = np.ones(22)
@@ -70,11 +72,22 @@ def test_what_no_photograph_shows(code, given, dtype):
 def test_each_status_is_said_in_words():
     shapes = {"pose": (0, 3), "shape": (0,), "translation": (3,), "vertices": (0, 3)}
     shapes |= {"joints": (0, 3), "keypoints": (0, 2)}
+    names = ("successful", "nonlinear_max_steps_reached", "not_finite", "unseen", *OUTSIDE)
     arrays = {name: jnp.zeros((7, *shape)) for name, shape in shapes.items()}
-    codes = jnp.arange(7)
-    result = FitResult(**arrays, steps=codes, terms={}, status=codes)
-    assert result.reason[4:] == [REASONS[code] for code in (DISTANCE, SIZE, FOCAL)]
+    each = [getattr(RESULTS, name) for name in names]
+    status = jax.tree.map(lambda *leaves: jnp.stack([*map(jnp.asarray, leaves)]), *each)
+    result = FitResult(**arrays, steps=jnp.arange(7), terms={}, status=status)
+    assert result.as_dict()["status"] == names_of(status) == list(names)
     assert result.converged.tolist() == [True] + [False] * 6
+    # The messages quote the limits, which stand elsewhere.
+    quoted = {
+        DISTANCE: (photograph.NEAREST, photograph.FARTHEST),
+        SIZE: (photograph.SMALLEST, photograph.LARGEST, photograph.LEAST_PIXELS),
+        FOCAL: (photograph.WIDEST,),
+    }
+    for reason, limits in zip(result.reason[4:], quoted.values(), strict=True):
+        assert reason.split(":")[0].endswith("outside any photograph")
+        assert all(f" {limit:g} " in reason for limit in limits)
 
 
 def test_focal_lengths_in_millimetres_are_too_wide():

@@ -15,10 +15,11 @@ from helpers_fit import camera, frames, objective, seen
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from spt_jax import PinholeCamera, fit_pose, intersection_report
+from spt_jax import RESULTS, PinholeCamera, fit_pose, intersection_report
 from spt_jax.fit.figure import Variables
 from spt_jax.fit.stages import descend, total_cost
 from spt_jax.fit.terms.regularisers import Regulariser, SelfIntersection, as_regulariser
+from spt_jax.status import names_of
 
 NAMES = (
     "walk/0010",
@@ -82,9 +83,11 @@ def test_terms_sum_to_the_total_and_say_what_was_used(plain):
     total = terms.pop("total")
     assert set(terms) == {"reprojection", "prior", "limits", "upright"}
     np.testing.assert_allclose(total, sum(np.asarray(term) for term in terms.values()), rtol=1e-5)
-    words = {0: "converged", 1: "stopped at the largest number of steps"}
-    assert plain.reason == [words[int(code)] for code in plain.status]
-    np.testing.assert_array_equal(plain.converged, plain.status == 0)
+    words = {True: "converged", False: "stopped at the largest number of steps"}
+    assert plain.reason == [words[ended] for ended in plain.converged.tolist()]
+    np.testing.assert_array_equal(plain.converged, plain.status == RESULTS.successful)
+    assert plain.as_dict()["terms"]["total"] == np.asarray(plain.terms["total"]).tolist()
+    assert "successful" in str(plain)
     # Joints below which nothing was seen do not move, and shape that is not fitted stays.
     middle = objective(np.zeros((22, 2), np.float32)).start.pose
     np.testing.assert_array_equal(plain.pose[:, 22:], jnp.stack([middle[22:]] * 8))
@@ -169,7 +172,7 @@ def test_under_jit_and_vmap_as_outside(plain, traced):
 
 
 def test_who_was_not_seen_at_all_is_said_under_jit(traced):
-    assert traced.status[4] == 3
+    assert names_of(traced.status)[4] == "unseen"
     assert traced.reason[4].startswith("no keypoint was seen")
     assert not traced.converged[4]
     for leaf in jax.tree.leaves(traced):
@@ -310,6 +313,6 @@ def test_too_few_steps_are_said():
         limits=None,
         max_steps=1,
     )
-    assert found.status.tolist() == [1, 1]
+    assert names_of(found.status) == ["nonlinear_max_steps_reached"] * 2
     assert found.reason == ["stopped at the largest number of steps"] * 2
     assert set(found.terms) == {"reprojection", "upright", "total"}

@@ -15,6 +15,7 @@ import pytest
 from helpers import embedded_body
 from helpers_body import synthetic_smpl
 
+from spt_jax import RESULTS
 from spt_jax.cli import main
 from spt_jax.commands import fitted
 from spt_jax.commands.kept import frame_arrays, frame_of
@@ -45,7 +46,7 @@ def stand(body, keypoints, camera, *, confidence, **_):
         keypoints=jnp.asarray(keypoints) + 1 / 3,
         steps=jnp.array(7),
         terms={"total": jnp.sum(confidence) / 3},
-        status=jnp.array(0),
+        status=RESULTS.successful,
     )
 
 
@@ -241,6 +242,7 @@ def test_a_frame_comes_back_to_the_bit(rng):
 
 _KILLED = """
 import os, signal
+from spt_jax import RESULTS
 from spt_jax.cli import main
 from spt_jax.untangle import pose
 

@@ -10,10 +10,9 @@ import pytest
 import trimesh
 from helpers import body_faces, embedded_body, mocap
 
-from spt_jax import BodyModel, self_intersection_penalty, untangle_pose
+from spt_jax import RESULTS, BodyModel, self_intersection_penalty, untangle_pose
 from spt_jax.overlap.measure import Unmeasurable
 from spt_jax.untangle import pose as untangle
-from spt_jax.untangle.results import RESULTS
 
 QUICK = {"folds": "count", "rays": 64, "weights": (0.1, 1.0, 10.0), "steps_per_weight": 20}
 
@@ -96,7 +95,7 @@ def test_collisions_go_and_nothing_else_moves():
     assert result.before.intersecting_pairs > 20 and result.before.volume > 1e-7
     assert result.after.intersecting_pairs == 0 and result.after.volume == 0
     assert result.after.total_volume > 0  # the armpits are left as they are
-    assert result.is_free and result.result == RESULTS.successful
+    assert result.is_free and result.status == RESULTS.successful
     moved = np.linalg.norm(result.vertices - body(pose).vertices, axis=1)
     assert moved.mean() < 0.002 and moved.max() < 0.02
 
@@ -149,7 +148,7 @@ def test_never_worse_than_the_start():
     np.testing.assert_array_equal(result.pose, pose)
     assert result.after.volume == result.before.volume > 0
     assert result.steps == 3 and not result.is_free
-    assert result.result != RESULTS.successful and result.reason != "collision-free"
+    assert result.status != RESULTS.successful and result.reason != "collision-free"
 
 
 @functools.cache
@@ -199,7 +198,7 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
         assert np.isfinite(part).all()
     np.testing.assert_array_equal(result.pose, swung(2.6))
     assert result.after.volume == result.before.volume and not result.is_free
-    assert result.result == RESULTS.nonlinear_divergence and "diverged" in result.reason
+    assert result.status == RESULTS.nonlinear_divergence and "diverged" in result.reason
     assert len(seen) >= 5 and any(np.isnan(volume) for _, _, volume in seen)
 
 
@@ -232,7 +231,7 @@ def test_each_pose_of_a_batch_says_how_it_ended(monkeypatch):
     poses = jnp.stack([swung(angle) for angle in (0.3, 2.6, 2.8)])
     result = untangle_pose(boxes(), poses)
     assert result.is_free.tolist() == [True, True, False]
-    assert (result.result == RESULTS.nonlinear_divergence).tolist() == [False, False, True]
+    assert (result.status == RESULTS.nonlinear_divergence).tolist() == [False, False, True]
     assert result.reason[:2] == ["collision-free"] * 2 and "diverged" in result.reason[2]
     assert np.isfinite(result.vertices).all()
 

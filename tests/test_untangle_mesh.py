@@ -29,7 +29,6 @@ from spt_jax.overlap.triangles.pairs import edge_crossings
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.freeing import _Search
 from spt_jax.untangle.mesh import untangle_mesh
-from spt_jax.untangle.results import RESULTS
 from spt_jax.untangle.spread import Spread, Surface
 
 
@@ -109,7 +108,7 @@ def test_what_does_not_cross_comes_back_to_the_bit():
         # does not hide it.
         assert result.after.volume == pytest.approx(volume, rel=0.1) and seen == []
         assert result.is_free == (volume == 0)
-        assert result.result == (RESULTS.enclosed if volume else RESULTS.successful)
+        assert result.status == (RESULTS.enclosed if volume else RESULTS.successful)
         assert ("wholly within another" in result.reason) == (volume > 0)
 
 
@@ -145,7 +144,7 @@ def test_never_worse_and_bounded_when_it_cannot():
         vertices, faces, attempts=2, steps_per_attempt=1, on_step=lambda *s: seen.append(s)
     )
     assert not result.is_free and result.steps == 2
-    assert result.result == RESULTS.nonlinear_max_steps_reached
+    assert result.status == RESULTS.nonlinear_max_steps_reached
     assert_no_worse(vertices, faces, result)
     # One part alone is not pushed away from others as it is.
     assert [step[:2] for step in seen] == [(0, 0), (1, 1), (2, 2)]
@@ -321,7 +320,7 @@ def test_a_step_into_nothing_ends_the_attempt(monkeypatch):
     )
     result = untangle_mesh(vertices, faces)
     assert result.vertices.tobytes() == vertices.tobytes() and not result.is_free
-    assert result.result == RESULTS.nonlinear_divergence and "diverged" in result.reason
+    assert result.status == RESULTS.nonlinear_divergence and "diverged" in result.reason
 
 
 def test_double_precision_far_from_the_origin():

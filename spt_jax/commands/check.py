@@ -68,8 +68,6 @@ def check(
 def _judge(
     path: Path, rays: int | None, max_bytes: int | None, found: dict[str, Any]
 ) -> tuple[int, list[Any]]:
-    from dataclasses import asdict
-
     from spt_jax.arguments import as_rays
     from spt_jax.mesh_check import check_mesh
     from spt_jax.mesh_files import open_mesh
@@ -81,7 +79,7 @@ def _judge(
     vertices, faces = opened.vertices, opened.faces
     found["notes"] = list(opened.notes)
     checked = check_mesh(vertices, faces)
-    found["mesh"] = asdict(checked)
+    found["mesh"] = checked.as_dict()
     if not checked.ok:
         return 2, [checked, "[red]cannot be judged before that is put right[/red]"]
     with measurable(path.name):

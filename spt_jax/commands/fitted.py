@@ -13,6 +13,7 @@ from spt_jax.commands.annotated import Annotated
 from spt_jax.commands.frames import versions
 from spt_jax.fit import photograph
 from spt_jax.report import IntersectionReport
+from spt_jax.status import OUTSIDE, RESULTS, names_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,7 +39,7 @@ class Fitted:
     keypoints: Float[np.ndarray, "K 2"]
     distance: float  # of the root joint along the line of sight, in metres
     terms: dict[str, float]
-    status: int
+    status: str  # a name of `spt_jax.RESULTS`
     reason: str
     steps: int
     seconds: float
@@ -57,7 +58,7 @@ class Fitted:
     @property
     def outside(self) -> bool:
         """Whether no photograph could show it: camera or keypoints are in wrong units."""
-        return self.status in photograph.REASONS
+        return self.status in OUTSIDE
 
     @property
     def errors(self) -> Float[np.ndarray, "seen"]:
@@ -91,10 +92,10 @@ def as_fitted(
         with suppress(Unmeasurable):
             overlap = intersection_report(vertices, body.faces, rest_surface=rest_surface)
     root = np.asarray(one.camera.to_camera(result.joints[:1]))[0]
-    status, reason = int(result.status), result.reason
-    if status < 2 and photograph.is_too_wide(one.camera, one.size):
-        status = photograph.FOCAL
-        reason = photograph.REASONS[status]
+    status, reason = names_of(result.status), result.reason
+    ended = ("successful", "nonlinear_max_steps_reached")
+    if status in ended and photograph.is_too_wide(one.camera, one.size):
+        status, reason = "outside_focal_length", RESULTS[RESULTS.outside_focal_length]
     return Fitted(
         given=one,
         pose=np.asarray(result.pose),

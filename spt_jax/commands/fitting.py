@@ -16,7 +16,6 @@ from spt_jax.commands.terminal import State, user_errors
 if TYPE_CHECKING:
     from spt_jax.body import BodyModel
     from spt_jax.commands.unfinished import UnfinishedRun
-    from spt_jax.fit.people import Penetration
 
 Named = Literal["spt", "none", "spheres", "laplacian"]
 Robust = float | Literal["auto", "off"]
@@ -123,8 +122,8 @@ def fit_everyone(
             scene = {
                 "image": group[0].image,
                 "people": [one.name for one in group],
-                "before": _penetration_report(together.before),
-                "after": _penetration_report(together.after),
+                "before": together.before.as_dict(),
+                "after": together.after.as_dict(),
             }
         else:
             each = ("confidence", "robust")
@@ -144,15 +143,6 @@ def fit_everyone(
         found += people
         told += [] if scene is None else [scene]
     return found, told
-
-
-def _penetration_report(found: "Penetration") -> dict[str, float | int]:
-    return {
-        "volume_between": float(found.volume_between),
-        "volume_within": float(found.volume_within),
-        "intersecting_pairs_between": int(found.intersecting_pairs_between),
-        "intersecting_pairs_within": int(found.intersecting_pairs_within),
-    }
 
 
 def _robust_scales(people: Sequence[Annotated], robust: Robust) -> np.ndarray | None:

@@ -4,7 +4,6 @@ import dataclasses
 import inspect
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,12 +25,14 @@ from spt_jax.groups import between_groups, join_bodies, within_groups
 from spt_jax.overlap.measure import Unmeasurable
 from spt_jax.report import intersection_report
 from spt_jax.rest_surface import RestSurface
+from spt_jax.result import Result, plain
+from spt_jax.status import RESULTS
 
 # What is tried where people still intersect: the margin, times this, with the last weight again.
 _WIDER = (2.0, 4.0, 8.0)
 
 
-class Penetration(eqx.Module):
+class Penetration(Result):
     """How deep people are in each other and in themselves, folds of the skin left out.
 
     Attributes:
@@ -45,8 +46,24 @@ class Penetration(eqx.Module):
     intersecting_pairs_between: Int[Array, ""]
     intersecting_pairs_within: Int[Array, ""]
 
+    @property
+    def is_free(self) -> bool:
+        """Whether no faces intersect and no parts overlap, folds left out."""
+        pairs = int(self.intersecting_pairs_between), int(self.intersecting_pairs_within)
+        return pairs == (0, 0) and float(self.volume_between) + float(self.volume_within) == 0
 
-class PeopleResult(eqx.Module):
+    def as_dict(self) -> dict[str, Any]:
+        """All numbers as JSON types."""
+        return {
+            "is_free": self.is_free,
+            "volume_between": plain(self.volume_between),
+            "volume_within": plain(self.volume_within),
+            "intersecting_pairs_between": plain(self.intersecting_pairs_between),
+            "intersecting_pairs_within": plain(self.intersecting_pairs_within),
+        }
+
+
+class PeopleResult(Result):
     """What `fit_people` found.
 
     Attributes:
@@ -60,6 +77,26 @@ class PeopleResult(eqx.Module):
     before: Penetration
     after: Penetration
     steps: Int[Array, ""]
+
+    @property
+    def status(self) -> RESULTS:
+        """How the fit of each person ended."""
+        return self.people.status
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no faces intersect between or within people, folds left out."""
+        return self.after.is_free
+
+    def as_dict(self) -> dict[str, Any]:
+        """How the fits ended and what is left of the overlap, as JSON types."""
+        return {
+            "is_free": self.is_free,
+            **self.people.as_dict(),
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "steps": plain(self.steps),
+        }
 
 
 def fit_people(

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax.camera import PinholeCamera
 from spt_jax.fit.objective import Objective
+from spt_jax.status import RESULTS
 
 # In metres, of what was seen of a person: from a hand before the lens to a figure at which COCO's
 # annotators stop marking keypoints, about 30 pixels tall, under the longest of lenses.
@@ -18,14 +19,12 @@ LEAST_PIXELS = 8.0
 # In degrees: the corners of the widest lenses that keep lines straight are 67 degrees off the axis.
 WIDEST = 70.0
 
-#: The statuses of `FitResult` that say so.
-DISTANCE, SIZE, FOCAL = 4, 5, 6
-REASONS = {
-    DISTANCE: f"distance outside any photograph: not {NEAREST:g} to {FARTHEST:g} m from the camera",
-    SIZE: f"size outside any photograph: not {SMALLEST:g} to {LARGEST:g} m, or less than "
-    f"{LEAST_PIXELS:g} pixels",
-    FOCAL: f"focal length outside any photograph: what is seen is more than {WIDEST:g} degrees off "
-    "the optical axis",
+# What `outside_photographs` finds, and the status of a fit that says so, limits and all.
+DISTANCE, SIZE, FOCAL = 1, 2, 3
+STATUSES = {
+    DISTANCE: RESULTS.outside_distance,
+    SIZE: RESULTS.outside_size,
+    FOCAL: RESULTS.outside_focal_length,
 }
 
 _SLOPE = float(np.tan(np.radians(WIDEST)))
@@ -34,7 +33,7 @@ _SLOPE = float(np.tan(np.radians(WIDEST)))
 def outside_photographs(
     objective: Objective, vector: Float[Array, "D"], vertices: Float[Array, "V 3"]
 ) -> Int[Array, ""]:
-    """The status of a fit that no photograph could show: DISTANCE, SIZE or FOCAL; 0 otherwise.
+    """Why no photograph could show a fit: DISTANCE, SIZE or FOCAL; 0 if one could.
 
     Args:
         objective: of the person; its seen keypoints tell the distance.

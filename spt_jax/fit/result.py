@@ -2,25 +2,22 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.body import BodyModel
 from spt_jax.fit import photograph
 from spt_jax.fit.objective import Objective
+from spt_jax.result import Result, plain
+from spt_jax.status import RESULTS, in_words, names_of
 
-_REASONS = (
-    "converged",
-    "stopped at the largest number of steps",
-    "not finite: keypoints or camera are unusable",
-    "no keypoint was seen: this is where the fit started",
-    *(photograph.REASONS[code] for code in sorted(photograph.REASONS)),
-)
+_WORDS = {
+    "successful": "converged",
+    "nonlinear_max_steps_reached": "stopped at the largest number of steps",
+}
 
 
-class FitResult(eqx.Module):
+class FitResult(Result):
     """What `fit_pose` found.
 
     Attributes:
@@ -33,9 +30,7 @@ class FitResult(eqx.Module):
         terms: what each term costs at the end: "reprojection", "prior", "limits", "shape",
             "upright" and the regulariser's name, weighted, those that were used; their sum is
             "total". `fit_pose` says what they are.
-        status: 0 converged; 1 stopped at the largest number of steps; 2 not finite; 3 no keypoint
-            was seen; 4, 5 and 6: distance, size or focal length lie outside any photograph, so that
-            camera or keypoints are in other units than pixels. `reason` says it in words.
+        status: how it ended, one of `spt_jax.RESULTS` for each person; `reason` says it in words.
     """
 
     pose: Float[Array, "*batch J 3"]
@@ -46,18 +41,26 @@ class FitResult(eqx.Module):
     keypoints: Float[Array, "*batch K 2"]
     steps: Int[Array, "*batch"]
     terms: dict[str, Float[Array, "*batch"]]
-    status: Int[Array, "*batch"]
+    status: RESULTS
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
         """Whether the last stage ended at a minimum that a photograph could show."""
-        return self.status == 0
+        return self.status == RESULTS.successful
 
     @property
     def reason(self) -> Any:
         """The status in words: a string, or nested lists of strings over the batch axes."""
-        words = np.array(_REASONS, dtype=object)[np.asarray(self.status)]
-        return words if isinstance(words, str) else words.tolist()
+        return in_words(self.status, _WORDS)
+
+    def as_dict(self) -> dict[str, Any]:
+        """How the fit ended and what its terms cost, as JSON types."""
+        return {
+            "status": names_of(self.status),
+            "reason": self.reason,
+            "terms": {name: plain(cost) for name, cost in self.terms.items()},
+            "steps": plain(self.steps),
+        }
 
 
 def fit_result(
@@ -86,9 +89,12 @@ def fit_result(
     terms["total"] = sum(terms.values(), jnp.zeros((), vector.dtype))
     finite = jnp.all(jnp.isfinite(posed.vertices)) & jnp.isfinite(terms["total"])
     outside = photograph.outside_photographs(objective, vector, posed.vertices)
-    status = jnp.where(outside == 0, jnp.where(converged, 0, 1), outside)
-    status = jnp.where(finite, status, 2)
-    status = jnp.where(jnp.any(objective.confidence > 0), status, 3)
+    ended: Any = RESULTS.successful, RESULTS.nonlinear_max_steps_reached
+    status: Any = RESULTS.where(converged, *ended)
+    for code, one in photograph.STATUSES.items():
+        status = RESULTS.where(outside == code, one, status)
+    status = RESULTS.where(finite, status, RESULTS.not_finite)
+    status = RESULTS.where(jnp.any(objective.confidence > 0), status, RESULTS.unseen)
     return FitResult(
         pose=found.pose,
         shape=found.shape,

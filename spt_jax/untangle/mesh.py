@@ -1,7 +1,6 @@
 """Remove any closed mesh's self-intersections by moving its vertices."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -13,33 +12,18 @@ from spt_jax.mesh_check import check_mesh, one_mesh
 from spt_jax.overlap.measure import Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.overlap.vectors import area_normals, dot
+from spt_jax.result import Overlap, Result
+from spt_jax.status import RESULTS, in_words, names_of
 from spt_jax.untangle.freeing import Freed, Place, free_vertices
-from spt_jax.untangle.results import RESULTS, in_words
 from spt_jax.untangle.spread import Surface
 
 
-@dataclass(frozen=True)
-class MeshOverlap:
-    """How much of a mesh is in self-intersection, measured exactly.
-
-    Attributes:
-        volume: the overlap volume, in the cube of the mesh's unit.
-        ratio: the fraction of the vertices in it (paper, Eq. 11).
-        intersecting_pairs: the number of face pairs that intersect; faces that only touch do not.
-    """
-
-    volume: float
-    ratio: float
-    intersecting_pairs: int
-
-
-@dataclass(frozen=True, eq=False)
-class UntangleMeshResult:
+class UntangleMeshResult(Result):
     """What `untangle_mesh` found.
 
     Attributes:
         vertices: the mesh's new positions, in the dtype given.
-        before, after: the overlap of the mesh given and of the mesh found.
+        before, after: the overlap of the mesh given and of the mesh found, measured exactly.
         moved: how many vertices are not where they were.
         median_displacement, largest_displacement: of those, in the mesh's unit; 0.0 for none.
         relative_displacement: the largest displacement against the size of the connected part that
@@ -48,7 +32,7 @@ class UntangleMeshResult:
             is not returned.
         flipped_triangles: triangles whose normal turned by more than 90 degrees.
         steps: of the search, over all attempts.
-        result: how it ended, one of `spt_jax.untangle.results.RESULTS`.
+        status: how it ended, one of `spt_jax.RESULTS`.
 
     Example:
         >>> import trimesh
@@ -61,8 +45,8 @@ class UntangleMeshResult:
     """
 
     vertices: Float[np.ndarray, "V 3"]
-    before: MeshOverlap
-    after: MeshOverlap
+    before: Overlap
+    after: Overlap
     moved: int
     median_displacement: float
     largest_displacement: float
@@ -70,25 +54,26 @@ class UntangleMeshResult:
     inverted_parts: int
     flipped_triangles: int
     steps: int
-    result: RESULTS
+    status: RESULTS
 
     @property
     def is_free(self) -> bool:
         """Whether no triangles intersect, nothing overlaps, and no part was turned inside out."""
-        return bool(self.result == RESULTS.successful)
+        return bool(self.status == RESULTS.successful)
 
     @property
     def reason(self) -> str:
-        """The result in words."""
-        return in_words(self.result, "intersection-free")
+        """The status in words."""
+        return in_words(self.status, {"successful": "intersection-free"})
 
     def as_dict(self) -> dict[str, Any]:
-        """All but the vertices, for JSON."""
+        """All but the vertices, as JSON types."""
         return {
             "is_free": self.is_free,
+            "status": names_of(self.status),
             "reason": self.reason,
-            "before": asdict(self.before),
-            "after": asdict(self.after),
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
             "moved": self.moved,
             "median_displacement": self.median_displacement,
             "largest_displacement": self.largest_displacement,
@@ -239,11 +224,11 @@ def untangle_checked(
         inverted_parts=found.best.inverted,
         flipped_triangles=_flipped(start, best, surface),
         steps=found.steps,
-        result=_result(found),
+        status=_status(found),
     )
 
 
-def _result(found: Freed) -> Any:
+def _status(found: Freed) -> Any:
     if not found.best.pairs:
         return RESULTS.successful if found.best.volume == 0 else RESULTS.enclosed
     if found.diverged:
@@ -251,9 +236,9 @@ def _result(found: Freed) -> Any:
     return RESULTS.nonlinear_max_steps_reached if found.ran_out else RESULTS.intersections_left
 
 
-def _overlap(place: Place) -> MeshOverlap:
+def _overlap(place: Place) -> Overlap:
     ratio = float(np.mean(place.labels != 0)) if len(place.labels) else 0.0
-    return MeshOverlap(place.volume, ratio, place.pairs)
+    return Overlap(place.volume, place.volume, ratio, place.pairs, place.pairs)
 
 
 def _flipped(before, after, surface: Surface) -> int:

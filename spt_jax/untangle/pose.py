@@ -20,8 +20,9 @@ from spt_jax.overlap.measure import Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.penalty import self_intersection_penalty
 from spt_jax.rest_surface import RestSurface
+from spt_jax.result import Overlap, Result, plain
+from spt_jax.status import RESULTS, in_words, names_of
 from spt_jax.untangle.mesh import untangle_checked
-from spt_jax.untangle.results import RESULTS, in_words
 from spt_jax.untangle.spread import Surface
 
 Folds = Literal["ignore", "remove", "count"]
@@ -47,26 +48,7 @@ _AGAIN = 2
 _MOST_TURN = 2 * np.pi
 
 
-class Overlap(eqx.Module):
-    """How much of a body is in self-intersection.
-
-    Attributes:
-        volume: the overlap volume that counts, in m^3: without folds, unless they count.
-        total_volume: the same with folds.
-        ratio: the fraction of the vertices in overlaps that count (paper, Eq. 11).
-        intersecting_pairs: the number of face pairs that intersect and count; faces that only
-            touch do not intersect.
-        total_intersecting_pairs: the same with folds.
-    """
-
-    volume: Float[Array, "*batch"]
-    total_volume: Float[Array, "*batch"]
-    ratio: Float[Array, "*batch"]
-    intersecting_pairs: Int[Array, "*batch"]
-    total_intersecting_pairs: Int[Array, "*batch"]
-
-
-class UntangleResult(eqx.Module):
+class UntangleResult(Result):
     """What `untangle_pose` found.
 
     Attributes:
@@ -74,7 +56,7 @@ class UntangleResult(eqx.Module):
         vertices: the body in that pose, in metres; with folds="remove" its vertices were moved on.
         before, after: the overlap of the pose given and of what was found.
         steps: of the solver, over all weights.
-        result: how it ended, one of `spt_jax.untangle.results.RESULTS` for each pose.
+        status: how it ended, one of `spt_jax.RESULTS` for each pose.
     """
 
     pose: Float[Array, "*batch J 3"]
@@ -82,17 +64,28 @@ class UntangleResult(eqx.Module):
     before: Overlap
     after: Overlap
     steps: Int[Array, "*batch"]
-    result: RESULTS
+    status: RESULTS
 
     @property
     def is_free(self) -> Bool[Array, "*batch"]:
         """Whether no parts collide any more; with folds="remove", whether no faces intersect."""
-        return self.result == RESULTS.successful
+        return self.status == RESULTS.successful
 
     @property
     def reason(self) -> Any:
-        """The result in words: a string, or nested lists of strings over the batch axes."""
-        return in_words(self.result, "collision-free")
+        """The status in words: a string, or nested lists of strings over the batch axes."""
+        return in_words(self.status, {"successful": "collision-free"})
+
+    def as_dict(self) -> dict[str, Any]:
+        """All but pose and vertices, as JSON types."""
+        return {
+            "is_free": plain(self.is_free),
+            "status": names_of(self.status),
+            "reason": self.reason,
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "steps": plain(self.steps),
+        }
 
 
 def untangle_pose(
@@ -152,7 +145,7 @@ def untangle_pose(
     Returns:
         The pose with the fewest intersecting pairs, and of those the least overlap, among those
         measured after each weight, never worse than the one given; a pose in which nothing collides
-        comes back unchanged. `result` says how it ended, `is_free` whether nothing collides any
+        comes back unchanged. `status` says how it ended, `is_free` whether nothing collides any
         more. Where the solver runs away, to numbers that are not finite or to joints turned by more
         than a full turn, that place is not taken, and the next weight starts from the last one that
         could be measured.
@@ -349,14 +342,14 @@ def _untangle_one(
         if skin.moved:
             vertices = jnp.asarray(skin.vertices)
             after = search.measure(vertices, body.faces)
-        free, ended = skin.is_free, skin.result
+        free, ended = skin.is_free, skin.status
     return UntangleResult(
         pose=best,
         vertices=vertices,
         before=before,
         after=after,
         steps=jnp.asarray(steps),
-        result=_result(free, diverged, ended),
+        status=_status(free, diverged, ended),
     )
 
 
@@ -371,7 +364,7 @@ def _measured(search: _Search, body, pose, candidate, shape, translation):
         return None
 
 
-def _result(free: bool, diverged: bool, ended: Any) -> Any:
+def _status(free: bool, diverged: bool, ended: Any) -> Any:
     if free:
         return RESULTS.successful
     if diverged:
