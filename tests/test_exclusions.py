@@ -162,7 +162,7 @@ def test_penalty_labels_and_report_agree_on_bodies(frame, x64):
         assert (
             report.labels.any() and 0 < report.intersecting_pairs < report.total_intersecting_pairs
         )
-        assert "with what does not count" in str(report)
+        assert "with what is excluded" in str(report)
     else:
         assert value == 0 and not report.labels.any() and report.intersecting_pairs == 0
 

@@ -429,7 +429,7 @@ def test_a_mesh_file_that_does_not_come_free_says_so(tmp_path, capsys, monkeypat
     nested = join(sphere(subdivisions=2), sphere(0.5, subdivisions=1))
     trimesh.Trimesh(*nested, process=False).export(file)
     assert main(["untangle", str(file), "--out", str(tmp_path / "out")]) == 1
-    assert "within another whole" in capsys.readouterr().err
+    assert "enclosed in another" in capsys.readouterr().err
     written, _ = read_mesh(tmp_path / "out" / "pair_untangled.ply")
     np.testing.assert_array_equal(written, nested[0].astype(np.float32))  # as trimesh wrote them
 
