@@ -38,6 +38,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
     from spt_jax.untangle.pose import UntangleResult as UntangleResult
     from spt_jax.untangle.pose import untangle_pose as untangle_pose
+    from spt_jax.untangle.steps import Step as Step
 
 # Imported when they are first asked for: who only calls the penalty does not wait for optimistix.
 _LATER = {
@@ -46,6 +47,7 @@ _LATER = {
     "Penetration": "spt_jax.fit.people",
     "PeopleResult": "spt_jax.fit.people",
     "RESULTS": "spt_jax.status",
+    "Step": "spt_jax.untangle.steps",
     "UntangleMeshResult": "spt_jax.untangle.mesh",
     "UntangleResult": "spt_jax.untangle.pose",
     "fit_people": "spt_jax.fit.people",

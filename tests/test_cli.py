@@ -14,7 +14,7 @@ import trimesh
 from helpers_body import synthetic_smpl
 from trimesh.visual import ColorVisuals
 
-from spt_jax import cli
+from spt_jax import Step, cli
 from spt_jax.body import load_mocap
 from spt_jax.body.pose_files import read_poses, write_poses
 from spt_jax.cli import main
@@ -29,8 +29,8 @@ def calls(monkeypatch):
 
     def stand_in(body, pose, *, shape=None, translation=None, on_step=None, **options):
         made.append(dict(pose=pose, shape=shape, translation=translation, **options))
-        on_step(0, 1, 1e-4)
-        on_step(np.int32(1), np.int32(2), np.float32(1e-6))
+        on_step(Step(0, 1, np.zeros((4, 3)), np.asarray(pose)))
+        on_step(Step(1, 2, np.zeros((4, 3)), np.asarray(pose)))
         pose = 0.05 * pose
         vertices = body(pose, shape, translation).vertices
         return SimpleNamespace(
@@ -248,7 +248,8 @@ def test_what_is_a_fold_is_set_from_the_command_line(calls, tmp_path, capsys):
         assert f"left out as folds: {volume:.2f} cm³" in text
     assert [call["fold_distance"] for call in calls] == [None, 0.0, 9.0, None]
     assert counted[""] == counted["--fold-distance 9"] == 0
-    assert counted["--fold-distance 0"] > 50 < counted["--folds count"] == found["all"]
+    assert counted["--fold-distance 0"] > 50 < counted["--folds count"]
+    assert counted["--folds count"] == found["total_intersecting_pairs"]
 
 
 def test_a_pose_that_cannot_be_measured_is_named(calls, tmp_path, capsys):

@@ -85,7 +85,7 @@ EXPECTED = {
         "(6, 3)", "4.0", "[[0 1 2]]", "0.112 of the solid, -0.28 a unit along x"
     ),
     "recipes/own-body.md": the_worm_is_free,
-    "recipes/smplx.md": prints("cm^3 of collisions", "pairs of triangles"),
+    "recipes/smplx.md": prints("cm^3 of collisions", "intersecting pairs"),
     "recipes/body-models.md": prints("fit for the penalty", "after"),
     "recipes/people.md": what_is_between_and_within_adds_up,
     "recipes/keypoints.md": fits,

@@ -31,7 +31,7 @@ def test_real_poses_come_free():
     body = embedded_body()
     poses = jnp.stack([frame("crawl/0092"), frame("punch/0024")])
     seen = []
-    result = untangle_pose(body, poses, **QUICK, on_step=lambda *step: seen.append(step))
+    result = untangle_pose(body, poses, **QUICK, on_step=seen.append)
     assert result.pose.shape == poses.shape and result.vertices.shape == (2, 12272, 3)
     assert result.before.volume.shape == result.after.ratio.shape == result.steps.shape == (2,)
     for k in range(2):
@@ -42,9 +42,15 @@ def test_real_poses_come_free():
     assert (result.after.ratio < result.before.ratio).all()
     np.testing.assert_array_equal(result.pose[:, 0], poses[:, 0])  # the root stays
     np.testing.assert_allclose(result.vertices, body(result.pose).vertices, atol=1e-6)
-    # One report a weight, the steps counted up.
-    assert [stage for stage, _, _ in seen[:3]] == [0, 1, 2] and len(seen) <= 6
-    assert seen[1][1] > seen[0][1] and seen[2][1] == result.steps[0]
+    # Each step of the solver is reported, in order, and the last one is among what was measured.
+    first = seen[: int(result.steps[0])]
+    assert [step.steps for step in first] == list(range(1, len(first) + 1))
+    assert [step.stage for step in first] == sorted(step.stage for step in first)
+    assert len(seen) == int(result.steps.sum()) and first[-1].stage >= 1
+    assert first[-1].volume < 0.5 * first[0].volume
+    assert first[-1].intersecting_pairs < first[0].intersecting_pairs
+    posed = body(jnp.asarray(first[-1].pose)).vertices
+    np.testing.assert_allclose(first[-1].vertices, posed, atol=1e-6)
 
 
 def test_a_pose_without_overlap_comes_back_to_the_bit():
@@ -191,7 +197,7 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
         rays=rays,
         solver=running,
         steps_per_weight=4,
-        on_step=lambda *step: seen.append(step),
+        on_step=seen.append,
     )
     assert result.before.volume > 1e-4
     for part in (result.pose, result.vertices, result.after.volume, result.after.ratio):
@@ -199,7 +205,7 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
     np.testing.assert_array_equal(result.pose, swung(2.6))
     assert result.after.volume == result.before.volume and not result.is_free
     assert result.status == RESULTS.nonlinear_divergence and "diverged" in result.reason
-    assert len(seen) >= 5 and any(np.isnan(volume) for _, _, volume in seen)
+    assert len(seen) >= 5 and any(np.isnan(step.volume) for step in seen)
 
 
 @pytest.mark.slow

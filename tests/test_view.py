@@ -145,8 +145,8 @@ def test_a_pose_comes_free_as_untangle_pose_says_and_every_step_is_shown(balls):
 
 def test_a_stopped_search_leaves_the_step_last_shown(balls):
     bend(balls)
-    start = balls.pose.copy()
-    untangle_scene(balls, lambda vertices, text: None, lambda: True)
+    start, shown = balls.pose.copy(), []
+    untangle_scene(balls, lambda vertices, text: shown.append(vertices), lambda: len(shown) > 2)
     assert np.isfinite(balls.pose).all()
     assert 0 < np.abs(balls.pose - start).max() < 1.0
 

@@ -86,6 +86,7 @@ def untangle_frames(
     from spt_jax.exclusions import as_fold_surface
     from spt_jax.report import intersection_report
     from spt_jax.untangle.pose import untangle_pose
+    from spt_jax.untangle.steps import Step
 
     rest = as_fold_surface(body, fold_distance) if folds == "ignore" else None
     asked = {"rays": rays, "directions": directions, "rest_surface": rest}
@@ -100,9 +101,9 @@ def untangle_frames(
         shape = None if motion.shape is None else motion.shape[k]
         translation = None if motion.translation is None else motion.translation[k]
 
-        def on_step(stage: int, steps: int, volume: float, name: str = name) -> None:
-            volume = float(volume) * _CUBIC_CENTIMETRES
-            state(f"{name}: stage {int(stage)}, step {int(steps)}, {volume:.1f} cm³")
+        def on_step(step: Step, name: str = name) -> None:
+            # Without the volume, which costs as much as the step itself.
+            state(f"{name}: weight {step.stage + 1}, step {step.steps}")
 
         vertices = np.asarray(body(motion.pose[k], shape, translation).vertices)
         with measurable(name):

@@ -58,9 +58,11 @@ def untangle_mesh_file(
     start = time.perf_counter()
     with progress_bar(1, quiet) as state:
         from spt_jax.untangle.mesh import untangle_mesh
+        from spt_jax.untangle.steps import Step
 
-        def on_step(attempt: int, steps: int, pairs: int) -> None:
-            state(f"{path.name}: attempt {attempt + 1}, step {steps}, {pairs} pairs to part")
+        def on_step(step: Step) -> None:
+            pairs = f"{step.intersecting_pairs} intersecting pairs"
+            state(f"{path.name}: attempt {step.stage + 1}, step {step.steps}, {pairs}")
 
         # Half the rays, as for poses: the last intersections do not hang on them.
         sampling = {} if rays is None else {"rays": max(rays // 2, 1)}

@@ -9,7 +9,6 @@ Every step is measured: what the search returns is the best of all the places wh
 and what it was given where none of them is better in every respect.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +20,7 @@ from spt_jax.overlap.triangles.pairs import EdgeCrossings
 from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.spread import Spread, Surface
+from spt_jax.untangle.steps import OnStep, Step
 
 # How far a push spreads, in edges, by the root of the number of vertices in the overlap: wide
 # enough that the middle of a deep overlap and its rim move together. Of 0.17, 0.25 and 0.5, the
@@ -68,8 +68,6 @@ _TOUCHING = 8.0 * float(np.finfo(np.float64).eps)
 _EQUAL = 1e-9
 
 _EXACT = Sampling(None, ((0.0, 0.0, -1.0),))
-
-OnStep = Callable[[int, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +178,7 @@ def free_vertices(
         attempts: at most so many.
         steps_per_attempt: at most so many in each.
         whole_parts: whether connected parts are pushed apart as they are where no attempt did.
-        on_step: called with the attempt, the steps so far and the pairs of triangles that are to
-            be parted, before each step.
+        on_step: called with a `Step` before each step.
 
     Raises:
         Unmeasurable: the vertices given have no surface that could be measured.
@@ -334,6 +331,11 @@ class _Search:
             grown.append(_Region(region.members, min(factor * region.reach, _LONGEST_REACH)))
         return grown + new
 
+    def report(self, attempt: int, place: Place) -> None:
+        """Call `on_step` with a place."""
+        vertices = place.vertices.astype(self.dtype)
+        self.on_step(Step(attempt, self.steps, vertices, None, lambda: (place.volume, place.pairs)))
+
     def descend(
         self, reach: Float[np.ndarray, "V"], attempt: int, most: int
     ) -> tuple[Place, Place]:
@@ -343,7 +345,7 @@ class _Search:
         best = least = place = self.start
         idle = 0
         for _ in range(most):
-            self.on_step(attempt, self.steps, place.left)
+            self.report(attempt, place)
             if not place.left or idle >= _PATIENCE:
                 break
             self.steps += 1
@@ -399,7 +401,7 @@ class _Search:
         """
         best = place = self.start
         for _ in range(_RIGID_STEPS):
-            self.on_step(attempt, self.steps, place.left)
+            self.report(attempt, place)
             edge, corners = place.ends
             pairs = self.surface.part[np.stack([edge[:, 0], corners[:, 0]], axis=1)]
             pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)

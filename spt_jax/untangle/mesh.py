@@ -1,6 +1,5 @@
 """Remove any closed mesh's self-intersections by moving its vertices."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from spt_jax.result import Overlap, Result
 from spt_jax.status import RESULTS, in_words, names_of
 from spt_jax.untangle.freeing import Freed, Place, free_vertices
 from spt_jax.untangle.spread import Surface
+from spt_jax.untangle.steps import OnStep, no_step
 
 
 class UntangleMeshResult(Result):
@@ -92,7 +92,7 @@ def untangle_mesh(
     directions: Any = 3,
     attempts: int = 4,
     steps_per_attempt: int = 40,
-    on_step: Callable[[int, int, int], None] | None = None,
+    on_step: OnStep | None = None,
 ) -> UntangleMeshResult:
     r"""The mesh with its vertices moved until no triangles intersect, and never a worse one.
 
@@ -129,8 +129,7 @@ def untangle_mesh(
         directions: as in `self_intersection_penalty`.
         attempts: at most so many, each from the vertices given.
         steps_per_attempt: at most so many steps in each attempt.
-        on_step: called before each step with the index of the attempt, the steps so far and the
-            number of pairs of triangles that are to be parted.
+        on_step: called with a `spt_jax.Step` before each step; what it raises ends the search.
 
     Returns:
         The vertices of the first attempt that is intersection-free, else the best ones found: see
@@ -184,7 +183,7 @@ def untangle_checked(
     attempts: int = 4,
     steps_per_attempt: int = 40,
     whole_parts: bool = True,
-    on_step: Callable[[int, int, int], None] | None = None,
+    on_step: OnStep | None = None,
 ) -> UntangleMeshResult:
     """`untangle_mesh` for a mesh that is known to be fit: many poses of one body, say.
 
@@ -205,7 +204,7 @@ def untangle_checked(
         attempts=attempts,
         steps_per_attempt=steps_per_attempt,
         whole_parts=whole_parts,
-        on_step=on_step or _nothing,
+        on_step=on_step or no_step,
     )
     start, best = found.start.vertices, found.best.vertices
     shift = best - start
@@ -244,7 +243,3 @@ def _overlap(place: Place) -> Overlap:
 def _flipped(before, after, surface: Surface) -> int:
     first, second = (area_normals(points, surface.faces) for points in (before, after))
     return int(np.count_nonzero(dot(first, second) < 0))
-
-
-def _nothing(attempt: int, steps: int, pairs: int) -> None:
-    pass

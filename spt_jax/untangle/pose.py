@@ -1,6 +1,6 @@
 """Remove a posed body's self-intersections by moving its joints."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -24,6 +24,7 @@ from spt_jax.result import Overlap, Result, plain
 from spt_jax.status import RESULTS, in_words, names_of
 from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.spread import Surface
+from spt_jax.untangle.steps import OnStep, Step
 
 Folds = Literal["ignore", "remove", "count"]
 
@@ -103,7 +104,7 @@ def untangle_pose(
     steps_per_weight: int = 25,
     tolerance: float = 1e-9,
     solver: optx.AbstractMinimiser | None = None,
-    on_step: Callable[[int, int, float], None] | None = None,
+    on_step: OnStep | None = None,
 ) -> UntangleResult:
     """The pose nearest to the one given in which no body parts collide, as far as it goes.
 
@@ -139,8 +140,8 @@ def untangle_pose(
         tolerance: an overlap of this volume or less, in m^3, counts as none where no faces
             intersect; the default is 1 mm^3.
         solver: an optimistix minimiser; BFGS by default.
-        on_step: called with the index of the weight, the steps so far and the overlap volume that
-            counts whenever a weight is done.
+        on_step: called with a `spt_jax.Step` after each step of the solver; what it raises ends the
+            search. The solver's loop then runs in Python.
 
     Returns:
         The pose with the fewest intersecting pairs, and of those the least overlap, among those
@@ -217,7 +218,7 @@ def untangle_pose(
     translations = _per_pose("translation", translation, batch, len(poses))
     surface = Surface(np.asarray(body.faces), body.num_vertices) if way == "remove" else None
     found = [
-        _untangle_one(search, surface, body, *one, on_step or _nothing)
+        _untangle_one(search, surface, body, *one, on_step)
         for one in zip(poses, shapes, translations, strict=True)
     ]
     if not found:
@@ -298,7 +299,13 @@ def _as_search_rays(rays: Any) -> Rays:
 
 
 def _untangle_one(
-    search: _Search, surface: Surface | None, body, pose, shape, translation, on_step
+    search: _Search,
+    surface: Surface | None,
+    body: BodyModel,
+    pose: Array,
+    shape: Array | None,
+    translation: Array | None,
+    on_step: OnStep | None,
 ) -> UntangleResult:
     vertices = body(pose, shape, translation).vertices
     before = search.measure(vertices, body.faces)
@@ -309,7 +316,7 @@ def _untangle_one(
         moved = jnp.zeros(factor.shape[:1], pose.dtype)
         idle = 0
         for stage, (margin, weight) in enumerate(search.attempts()):
-            there, taken, ended = _descend(
+            arguments = (
                 search,
                 body,
                 (pose, shape, translation, factor),
@@ -317,19 +324,21 @@ def _untangle_one(
                 jnp.asarray(margin, pose.dtype),
                 jnp.asarray(weight, pose.dtype),
             )
+            if on_step is None:
+                there, taken, ended = _descend(*arguments)
+            else:
+                there, taken, ended = _descend_in_steps(*arguments, stage, steps, on_step)
             steps += int(taken)
             candidate = turned(pose, factor, there)
             found = _measured(search, body, pose, candidate, shape, translation)
             if found is None:
                 diverged = True
-                on_step(stage, steps, float("nan"))
                 continue
             moved, (posed, overlap) = there, found
             falls = float(overlap.volume) < 0.99 * float(after.volume)
             idle = 0 if falls else idle + 1
             if search.rank(overlap) < search.rank(after):
                 best, after, vertices = candidate, overlap, posed
-            on_step(stage, steps, float(overlap.volume))
             # The first weights may be too weak to move anything; two in a row that gain nothing
             # after that mean that the volume no longer falls.
             stuck = search.folds == "count" and idle >= 2 and stage > 2
@@ -389,24 +398,25 @@ def turned(pose, factor, moved):
     return pose.at[1:].add(_CENTIMETRE * turn.reshape(pose[1:].shape))
 
 
+def _objective(search: _Search, moved, arguments):
+    body, (pose, shape, translation, factor), margin, weight = arguments
+    vertices = body(turned(pose, factor, moved), shape, translation).vertices
+    if search.margin:
+        vertices = inflate(vertices, body.faces, margin / 2)
+    volume = self_intersection_penalty(
+        vertices,
+        body.faces,
+        rays=search.rays,
+        directions=np.array(search.directions),
+        rest_surface=search.rest,
+    )
+    return jnp.sum(moved**2) + weight * volume / _CENTIMETRE**3
+
+
 @eqx.filter_jit
 def _descend(search: _Search, body, fixed, moved, margin, weight):
-    def objective(moved, arguments):
-        body, (pose, shape, translation, factor), margin, weight = arguments
-        vertices = body(turned(pose, factor, moved), shape, translation).vertices
-        if search.margin:
-            vertices = inflate(vertices, body.faces, margin / 2)
-        volume = self_intersection_penalty(
-            vertices,
-            body.faces,
-            rays=search.rays,
-            directions=np.array(search.directions),
-            rest_surface=search.rest,
-        )
-        return jnp.sum(moved**2) + weight * volume / _CENTIMETRE**3
-
     solution = optx.minimise(
-        objective,
+        partial(_objective, search),
         search.solver,
         moved,
         (body, fixed, margin, weight),
@@ -414,6 +424,79 @@ def _descend(search: _Search, body, fixed, moved, margin, weight):
         throw=False,
     )
     return solution.value, solution.stats["num_steps"], RESULTS.promote(solution.result)
+
+
+def _descend_in_steps(
+    search: _Search, body, fixed, moved, margin, weight, stage: int, steps: int, on_step: OnStep
+):
+    """`_descend` with the solver's loop in Python, so that each step can be looked at.
+
+    The loop is that of https://docs.kidger.site/optimistix/examples/interactive-solves/.
+    """
+    arguments = (body, fixed, margin, weight)
+    state = _first_state(search, arguments, moved)
+    done, result = _terminated(search, arguments, moved, state)
+    taken = 0
+    while not done and taken < search.steps_per_weight:
+        moved, state, done, result, pose, vertices = _one_step(search, arguments, moved, state)
+        taken += 1
+        vertices, faces = np.asarray(vertices), body.faces
+        on_step(
+            Step(
+                stage,
+                steps + taken,
+                vertices,
+                np.asarray(pose),
+                partial(_volume_and_pairs, search, vertices, faces),
+            )
+        )
+    if not done:
+        result = RESULTS.nonlinear_max_steps_reached
+    return moved, taken, RESULTS.promote(result) if done else result
+
+
+def _volume_and_pairs(search: _Search, vertices, faces) -> tuple[float, int]:
+    try:
+        overlap = search.measure(vertices, faces)
+    except Unmeasurable:
+        return float("nan"), -1
+    return float(overlap.volume), int(overlap.intersecting_pairs)
+
+
+def _with_aux(search: _Search, moved, arguments):
+    return _objective(search, moved, arguments), None
+
+
+def _solving(search: _Search, arguments) -> dict[str, Any]:
+    return {
+        "fn": partial(_with_aux, search),
+        "args": arguments,
+        "options": {},
+        "tags": frozenset(),
+    }
+
+
+@eqx.filter_jit
+def _first_state(search: _Search, arguments, moved):
+    shape = jax.ShapeDtypeStruct((), moved.dtype)
+    return search.solver.init(
+        y=moved, f_struct=shape, aux_struct=None, **_solving(search, arguments)
+    )
+
+
+@eqx.filter_jit
+def _terminated(search: _Search, arguments, moved, state):
+    return search.solver.terminate(y=moved, state=state, **_solving(search, arguments))
+
+
+@eqx.filter_jit
+def _one_step(search: _Search, arguments, moved, state):
+    solving = _solving(search, arguments)
+    moved, state, _ = search.solver.step(y=moved, state=state, **solving)
+    done, result = search.solver.terminate(y=moved, state=state, **solving)
+    body, (pose, shape, translation, factor), _, _ = arguments
+    at = turned(pose, factor, moved)
+    return moved, state, done, result, at, body(at, shape, translation).vertices
 
 
 def _per_pose(name, array, batch, count):
@@ -428,7 +511,3 @@ def _per_pose(name, array, batch, count):
             f"{array.shape}."
         ) from None
     return list(spread.reshape(count, array.shape[-1]))
-
-
-def _nothing(stage: int, steps: int, volume: float) -> None:
-    pass

@@ -2,10 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 import optimistix as optx
 from jaxtyping import Float
@@ -13,127 +10,79 @@ from jaxtyping import Float
 from spt_jax.arguments import as_directions
 from spt_jax.overlap.measure import Sampling
 from spt_jax.untangle.mesh import untangle_checked
-from spt_jax.untangle.pose import turned, untangle_pose
+from spt_jax.untangle.pose import untangle_pose
 from spt_jax.untangle.spread import Surface
+from spt_jax.untangle.steps import Step
 from spt_jax.view.scene import Scene
 
 Show = Callable[[Float[np.ndarray, "V 3"], str], None]
 
-# Arrays above about 100 kB must not be operands of a callback (`host.py` says why).
-_PIECE = 20_000
-
-# Steps of the first looks at an untangling mesh; each search starts anew and goes twice as far.
-_MESH_LOOKS = (1, 2, 4, 8, 16)
+# One object, so that the solver is compiled once.
+_SOLVER = optx.BFGS(rtol=1e-3, atol=1e-3)
 
 
 class Stopped(Exception):
     """The user has had enough."""
 
 
-class _Relay:
-    """Where the running solver's steps go; called by XLA, so it raises nothing and uses no JAX."""
+class _Steps:
+    """Shows the steps of a search, and remembers the last one and what failed."""
 
-    def __init__(self):
-        self.target: Callable[[np.ndarray, np.ndarray], None] | None = None
+    def __init__(self, show: Show, stopped: Callable[[], bool]):
+        self._show, self._stopped = show, stopped
+        self._shown: Step | None = None
+        self._end = self._cost = 0.0
+        self.last: Step | None = None
         self.error: Exception | None = None
 
-    def __call__(self, pose, *pieces) -> None:
-        if self.target is None or self.error is not None:
+    def __call__(self, step: Step) -> None:
+        if self._stopped():
+            raise Stopped
+        self.last = step
+        start = time.perf_counter()
+        # Rejected steps show nothing new, and looking must not take longer than searching.
+        same = self._shown is not None and np.array_equal(step.vertices, self._shown.vertices)
+        if same or self.error is not None or start - self._end < 0.5 * self._cost:
             return
+        self._shown = step
         try:
-            flat = np.concatenate([np.asarray(piece) for piece in pieces])
-            self.target(np.array(pose), flat.reshape(-1, 3))
-        except Exception as error:
+            self._show(step.vertices, f"step {step.steps}")
+        except Exception as error:  # the search goes on; `raise_error` says what failed
             self.error = error
+        self._end = time.perf_counter()
+        self._cost = self._end - start
 
-
-class _Watched(optx.AbstractMinimiser):
-    """A minimiser whose every accepted step is posed and handed to a relay."""
-
-    inner: optx.AbstractMinimiser
-    relay: _Relay = eqx.field(static=True)
-
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.inner.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.inner.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.inner.norm
-
-    def init(self, *args):
-        return self.inner.init(*args)
-
-    def step(self, fn, y, args, options, state, tags):
-        y, state, aux = self.inner.step(fn, y, args, options, state, tags)
-        body, (pose, shape, translation, factor), *_ = args
-        at = turned(pose, factor, y)
-        flat = body(at, shape, translation).vertices.reshape(-1)
-        pieces = [flat[start : start + _PIECE] for start in range(0, flat.size, _PIECE)]
-        jax.debug.callback(self.relay, at, *pieces)
-        return y, state, aux
-
-    def terminate(self, *args):
-        return self.inner.terminate(*args)
-
-    def postprocess(self, *args):
-        return self.inner.postprocess(*args)
-
-
-# One object, so that the solver is compiled once.
-_RELAY = _Relay()
-_SOLVER = _Watched(  # pyright: ignore[reportCallIssue]
-    inner=optx.BFGS(rtol=1e-3, atol=1e-3), relay=_RELAY
-)
+    def raise_error(self) -> None:
+        """Raise what `show` raised."""
+        if self.error is not None:
+            raise self.error
 
 
 def untangle_scene(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:
-    """Free a scene, its steps shown as they are found.
+    """Untangle a scene, its steps shown as they are found.
 
-    A body is freed by `untangle_pose`, folds left aside; where folds count, its skin then by
-    `untangle_mesh`. A mesh is freed by `untangle_mesh`.
+    A body is untangled by `untangle_pose`, folds left aside; where folds count, its skin then by
+    `untangle_mesh`. A mesh is untangled by `untangle_mesh`.
 
     Args:
-        scene: changed to what was found; to the step last shown where stopped.
-        show: called with vertices and a line of text, from another thread too.
-        stopped: asked between steps, or between the weights of a pose.
+        scene: changed to what was found; to the last step where stopped.
+        show: called with vertices and a line of text.
+        stopped: asked between steps.
 
     Raises:
         Unmeasurable: there is nothing to measure in what the scene shows.
     """
     try:
         if scene.body is not None:
-            _free_pose(scene, show, stopped)
+            _untangle_pose(scene, show, stopped)
         if scene.body is None or scene.count_folds:
-            _free_vertices(scene, show, stopped)
+            _untangle_vertices(scene, show, stopped)
     except Stopped:
         pass
 
 
-def _free_pose(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:
-    last: dict[str, Any] = {"pose": None, "steps": 0, "end": 0.0, "cost": 0.0}
-
-    def on_vertices(pose: np.ndarray, vertices: np.ndarray) -> None:
-        same = last["pose"] is not None and np.array_equal(pose, last["pose"])
-        last["pose"], last["steps"] = pose, last["steps"] + 1
-        start = time.perf_counter()
-        # Rejected steps show nothing new, and looking must not take longer than searching.
-        if same or start - last["end"] < 0.5 * last["cost"]:
-            return
-        show(vertices, f"step {last['steps']}")
-        last["end"] = time.perf_counter()
-        last["cost"] = last["end"] - start
-
-    def on_weight(stage: int, steps: int, volume: float) -> None:
-        # Between two programs; from within one nothing may be raised.
-        if stopped():
-            raise Stopped
-
-    _RELAY.target, _RELAY.error = on_vertices, None
+def _untangle_pose(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:
+    steps = _Steps(show, stopped)
     try:
         result = untangle_pose(
             scene.body,  # pyright: ignore[reportArgumentType]
@@ -141,39 +90,30 @@ def _free_pose(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:
             shape=scene.shape,
             translation=scene.translation,
             solver=_SOLVER,
-            on_step=on_weight,
+            on_step=steps,
         )
         scene.set_pose(np.asarray(result.pose))
     except Stopped:
-        if last["pose"] is not None:
-            scene.set_pose(last["pose"])
+        if steps.last is not None and steps.last.pose is not None:
+            scene.set_pose(steps.last.pose)
         raise
-    finally:
-        jax.effects_barrier()
-        _RELAY.target = None
-    if _RELAY.error is not None:
-        raise _RELAY.error
+    steps.raise_error()
 
 
-def _free_vertices(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:
-    # The search starts from the same vertices every time and is deterministic, so a short one ends
-    # where a long one passes; the first that frees the mesh has found what the long one finds.
+def _untangle_vertices(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:
     vertices = scene.vertices
     surface = Surface(scene.faces, len(vertices))
-    sampling = Sampling(None, as_directions(3))
-
-    def on_step(attempt: int, steps: int, pairs: int) -> None:
-        if stopped():
-            raise Stopped
-
-    for steps in (*_MESH_LOOKS, None):
-        looks = {"attempts": 1, "steps_per_attempt": steps, "whole_parts": False}
-        most = {} if steps is None else looks
-        found = untangle_checked(vertices, surface, sampling, on_step=on_step, **most)
-        scene.set_free_vertices(found.vertices)
-        show(
-            found.vertices,
-            f"step {found.steps}, {found.after.intersecting_pairs} intersecting pairs",
-        )
-        if not found.after.intersecting_pairs:
-            return
+    steps = _Steps(show, stopped)
+    try:
+        sampling = Sampling(None, as_directions(3))
+        found = untangle_checked(vertices, surface, sampling, on_step=steps)
+    except Stopped:
+        if steps.last is not None:
+            scene.set_free_vertices(steps.last.vertices)
+        raise
+    scene.set_free_vertices(found.vertices)
+    steps.raise_error()
+    show(
+        found.vertices,
+        f"step {found.steps}, {found.after.intersecting_pairs} intersecting pairs",
+    )
