@@ -17,10 +17,10 @@ import scipy.sparse
 import trimesh
 
 from spt_jax.body import load_body
-from spt_jax.body.pose_files import read_poses
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.keypoints import read_keypoints
 from spt_jax.mesh_files import read_mesh
+from spt_jax.pose_files import read_poses
 from spt_jax.show.overlay import read_image
 
 Arrays = list[np.ndarray]

@@ -32,7 +32,7 @@ _LONGEST_HEADER = 10_000
 
 # What zipfile and NumPy raise where bytes are cut, damaged, encrypted or packed in another way;
 # RuntimeError's subclass RecursionError stands for a header of nested brackets.
-_DAMAGE = (
+DAMAGE = (
     *(ValueError, TypeError, KeyError, SyntaxError, EOFError, RuntimeError, OverflowError),
     *(OSError, struct.error, zipfile.BadZipFile, zlib.error),
 )
@@ -249,7 +249,7 @@ def read_npz(
     with file_errors(what, file), open(file, "rb") as stream:
         try:
             archive = zipfile.ZipFile(stream)
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise ValueError(
                 f"{what} must be an .npz archive: got {name!r}, which is none ({error}); it is "
                 "another kind of file, truncated or damaged."
@@ -263,8 +263,8 @@ def read_npz(
         size = os.fstat(stream.fileno()).st_size
         headers, total = {}, 0
         for n, member in found.items():
-            with _named_field(n, name):
-                headers[n] = _array_header(archive, member, size)
+            with named_field(n, name):
+                headers[n] = array_header(archive, member, size)
             shape, _, dtype = headers[n]
             total += math.prod(shape) * max(dtype.itemsize, 8)
             check_bytes(
@@ -272,7 +272,7 @@ def read_npz(
             )
         arrays = {}
         for n, member in found.items():
-            with _named_field(n, name):
+            with named_field(n, name):
                 arrays[n] = _array(archive, member, *headers[n])
     return Npz(arrays, names)
 
@@ -290,13 +290,14 @@ def check_archive(
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ValueError(f"{what} must be a zip archive: got {name!r} ({error}).") from error
     check_bytes(what, path, sum(member.file_size for member in members), max_bytes)
 
 
 @contextmanager
-def _named_field(field: str, path: str) -> Iterator[None]:
+def named_field(field: str, path: str) -> Iterator[None]:
+    """Turn whatever damage raises into an error with the field's and the file's name."""
     try:
         yield
     except _ObjectArrayError as error:
@@ -309,7 +310,7 @@ def _named_field(field: str, path: str) -> Iterator[None]:
             f"{field} in {path} must fit into memory, of which there is not enough; free some, or "
             "take a smaller file."
         ) from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ValueError(
             f"{field} in {path} cannot be read: {error}; the file is truncated or damaged, make "
             "or download it again."
@@ -320,16 +321,33 @@ class _ObjectArrayError(ValueError):
     pass
 
 
-def _array_header(
-    archive: zipfile.ZipFile, member: zipfile.ZipInfo, file_size: int
+def array_header(
+    archive: zipfile.ZipFile, member: zipfile.ZipInfo, file_size: int, *, objects: bool = False
 ) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, Fortran's order or not, and dtype, once they agree with the bytes that there are."""
+    """Shape, Fortran's order or not, and dtype, once they agree with the bytes that there are.
+
+    Args:
+        archive, member: the array, in an .npz.
+        file_size: of the .npz.
+        objects: let arrays of objects pass, whose bytes do not follow from their shape.
+
+    Raises:
+        ValueError and whatever else damage raises: they do not agree.
+    """
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError("it is packed in a way that NumPy does not use")
     packed = min(member.compress_size, file_size - member.header_offset)
     if member.file_size > packed * _MOST_DEFLATED:
         raise ValueError(f"it announces {member.file_size:,} bytes packed into {packed:,}")
-    with archive.open(member) as stream, warnings.catch_warnings():
+    with archive.open(member) as stream:
+        return npy_header(stream, member.file_size, objects=objects)
+
+
+def npy_header(
+    stream: Any, size: int, *, objects: bool = False
+) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """The same of a binary stream that holds an array of `size` bytes, header included."""
+    with warnings.catch_warnings():
         # A header as Python 2 wrote it is as good as another.
         warnings.simplefilter("ignore", UserWarning)
         version = np.lib.format.read_magic(stream)
@@ -343,14 +361,13 @@ def _array_header(
         else:
             shape, fortran, dtype = np.lib.format.read_array_header_2_0(stream)
         start = stream.tell()
-    if dtype.hasobject:
+    if dtype.hasobject and not objects:
         raise _ObjectArrayError
     if any(length < 0 for length in shape):
         raise ValueError(f"it announces the shape {shape}")
-    if math.prod(shape) * dtype.itemsize != member.file_size - start:
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != size - start:
         raise ValueError(
-            f"it announces {shape} entries of {dtype.itemsize} bytes and has "
-            f"{member.file_size - start:,} bytes"
+            f"it announces {shape} entries of {dtype.itemsize} bytes and has {size - start:,} bytes"
         )
     return shape, fortran, dtype
 

@@ -16,10 +16,10 @@ from trimesh.visual import ColorVisuals
 
 from spt_jax import Step, cli
 from spt_jax.body import load_mocap
-from spt_jax.body.pose_files import read_poses, write_poses
 from spt_jax.cli import main
 from spt_jax.commands.demo import DEMO_FRAMES
 from spt_jax.commands.untangle import select_frames
+from spt_jax.pose_files import read_poses, write_poses
 
 
 @pytest.fixture

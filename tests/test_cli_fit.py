@@ -15,7 +15,6 @@ from rich.console import Console
 
 from spt_jax import RESULTS
 from spt_jax.body import load_body
-from spt_jax.body.pose_files import read_poses
 from spt_jax.cli import main
 from spt_jax.commands import fitted
 from spt_jax.commands.annotated import read_camera, select_people
@@ -24,6 +23,7 @@ from spt_jax.fit import pose as fitting
 from spt_jax.fit.people import Penetration, PeopleResult
 from spt_jax.fit.result import FitResult
 from spt_jax.keypoints import LAYOUTS
+from spt_jax.pose_files import read_poses
 from spt_jax.report import IntersectionReport
 from spt_jax.show.overlay import read_image
 from spt_jax.status import OUTSIDE

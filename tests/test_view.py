@@ -12,9 +12,9 @@ import trimesh
 from helpers_body import PARENTS, ball_arrays, slow_rotation
 
 from spt_jax import cli, intersection_report, load_body, untangle_mesh, untangle_pose
-from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.mesh_files import PENETRATING_COLOR, read_mesh, write_mesh
+from spt_jax.pose_files import MotionFile, Track, read_poses, write_poses
 from spt_jax.view import files
 from spt_jax.view.freeing import untangle_scene
 from spt_jax.view.panel import figures
@@ -218,7 +218,7 @@ def test_files_are_told_apart(balls, ball_file, pair_file, tmp_path):
     assert balls.body.num_joints == 24 and balls.name == "balls"
     assert scene_of(pair_file).body is None
     write_poses(tmp_path / "poses.npz", np.zeros((2, 22, 3)))
-    assert isinstance(files.open_file(tmp_path / "poses.npz"), PoseFile)
+    assert isinstance(files.open_file(tmp_path / "poses.npz"), MotionFile)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,8 @@ def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
         ("poses.npz", b"not an archive", "must be an .npz archive: got 'poses.npz'"),
         ("model.pkl", b"not a pickle", "model.pkl"),
         ("mesh.ply", b"ply\nnonsense", "must be a readable .ply file: got 'mesh.ply'"),
-        ("notes.txt", b"hello", "one of the suffixes"),
+        ("notes.txt", b"hello", "got 'notes.txt', which begins like none of them"),
+        ("notes.xyz", b"hello", "one of the suffixes"),
         ("../../evil.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "must be closed"),
     ],
 )
@@ -282,7 +283,7 @@ def test_what_is_saved_reads_back(balls, tmp_path):
 
 
 def test_what_a_body_cannot_take_is_said(balls):
-    given = PoseFile(np.full((1, 52, 3), 0.1), np.ones(16), None, ["a"])
+    given = Track("a", np.full((1, 52, 3), 0.1), shape=np.ones(16), names=["a"])
     frames, notes = files.frames_for(given, balls.body, embedded=False)
     assert frames.shape.shape == (1, 2) and frames.pose.shape == (1, 24, 3)
     assert "after the body's 2" in notes[0] and "left_index1" in notes[1]

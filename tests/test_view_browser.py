@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from spt_jax.body.pose_files import read_poses
 from spt_jax.mesh_files import read_mesh
+from spt_jax.pose_files import read_poses
 
 pytest.importorskip("viser", reason="the live view needs viser")
 

@@ -12,7 +12,7 @@ pytest.importorskip("viser", reason="the live view needs viser")
 
 from helpers_view import PART, SECONDS, Browser, served, wait_until
 
-from spt_jax.body.pose_files import PoseFile, write_poses
+from spt_jax.pose_files import MotionFile, write_poses
 from spt_jax.view import files
 from spt_jax.view.scene import Scene
 
@@ -182,10 +182,11 @@ def test_only_a_plain_suffix_reaches_the_disk(name, suffix, monkeypatch):
 def test_frames_are_called_after_the_file_that_was_sent(tmp_path):
     np.savez(tmp_path / "walk.npz", poses=np.zeros((2, 66)))
     opened = files.open_upload("walk.npz", (tmp_path / "walk.npz").read_bytes())
-    assert isinstance(opened, PoseFile) and opened.names == ["walk/0000", "walk/0001"]
+    assert isinstance(opened, MotionFile)
+    assert opened.tracks[0].names == ["walk/0000", "walk/0001"]
     write_poses(tmp_path / "named.npz", np.zeros((1, 22, 3)), names=["mine"])
     named = files.open_upload("x.npz", (tmp_path / "named.npz").read_bytes())
-    assert isinstance(named, PoseFile) and named.names == ["mine"]
+    assert isinstance(named, MotionFile) and named.tracks[0].names == ["mine"]
 
 
 def test_a_file_that_names_another_file_does_not_get_it(tmp_path):

@@ -26,7 +26,7 @@ _MAX_BYTES = 2**30
 _LARGEST_SCALAR = 64
 
 
-class _StandIn:
+class StandIn:
     """Holds the state of an object whose own class is not wanted here."""
 
     __slots__ = ("state",)
@@ -37,7 +37,7 @@ class _StandIn:
         self.state = state
 
 
-class _Chumpy(_StandIn):
+class _Chumpy(StandIn):
     """chumpy.ch.Ch: an array, `x`."""
 
     __slots__ = ()
@@ -46,7 +46,7 @@ class _Chumpy(_StandIn):
         return _dense(plain(self.state["x"], max_bytes), max_bytes)
 
 
-class _ChumpySelect(_StandIn):
+class _ChumpySelect(StandIn):
     """chumpy.reordering.Select: entries `idxs` of another array, reshaped."""
 
     __slots__ = ()
@@ -57,7 +57,7 @@ class _ChumpySelect(_StandIn):
         return picked.reshape(self.state["preferred_shape"])
 
 
-class _Sparse(_StandIn):
+class _Sparse(StandIn):
     """A scipy.sparse matrix or array."""
 
     __slots__ = ()
@@ -106,26 +106,35 @@ class _SparseCoordinates(_Sparse):
         return state["row"], state["col"]
 
 
-class _Function:
+class Admitted:
     """A function that a pickle may call, without attributes that it could set."""
 
     __slots__ = ()
 
 
-class _Reconstruct(_Function):
+class _NumpyArrayName(Admitted):
+    """numpy.ndarray, which arrays name and nothing may call: it allocates what is announced."""
+
+    __slots__ = ()
+
+
+NumpyArrayName = _NumpyArrayName()
+
+
+class _Reconstruct(Admitted):
     """numpy's _reconstruct, for plain arrays only."""
 
     __slots__ = ()
 
     def __call__(self, subtype, shape, dtype):
-        if subtype is not np.ndarray:
+        if subtype is not NumpyArrayName:
             raise TypeError(f"arrays are rebuilt as numpy.ndarray only, not as {subtype!r}")
         if tuple(shape) != (0,):  # as NumPy writes it: size and content follow
             raise ValueError(f"arrays are rebuilt from nothing: got an announced shape {shape}")
         return multiarray._reconstruct(np.ndarray, shape, dtype)
 
 
-class _Scalar(_Function):
+class _Scalar(Admitted):
     """numpy's scalar, for plain numbers and strings only."""
 
     __slots__ = ()
@@ -141,7 +150,7 @@ class _Scalar(_Function):
         return np.frombuffer(raw, dtype, count=1)[0]
 
 
-class _FromBuffer(_Function):
+class _FromBuffer(Admitted):
     """numpy's _frombuffer, which protocol 5 uses."""
 
     __slots__ = ()
@@ -150,18 +159,18 @@ class _FromBuffer(_Function):
         return np.frombuffer(buffer, dtype).reshape(shape, order=order)
 
 
-class _Rebuild(_Function):
+class _Rebuild(Admitted):
     """copyreg's _reconstructor, for the stand-ins only."""
 
     __slots__ = ()
 
     def __call__(self, cls, base, state):
-        if not (isinstance(cls, type) and issubclass(cls, _StandIn)) or base is not object:
+        if not (isinstance(cls, type) and issubclass(cls, StandIn)) or base is not object:
             raise TypeError(f"copyreg._reconstructor may rebuild stand-ins only, not {cls!r}")
         return cls()
 
 
-class _Encode(_Function):
+class _Encode(Admitted):
     """_codecs.encode, by which Python 3 writes bytes in protocol 2: Latin-1 only."""
 
     __slots__ = ()
@@ -174,7 +183,7 @@ class _Encode(_Function):
 
 def _admitted() -> dict[tuple[str, str], Any]:
     table: dict[tuple[str, str], Any] = {
-        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "ndarray"): NumpyArrayName,
         ("numpy", "dtype"): np.dtype,
         ("copyreg", "_reconstructor"): _Rebuild(),
         ("copy_reg", "_reconstructor"): _Rebuild(),
@@ -198,7 +207,8 @@ def _admitted() -> dict[tuple[str, str], Any]:
     return table
 
 
-_ADMITTED = _admitted()
+ADMITTED = _admitted()
+"""By module and name, what answers it."""
 
 
 class RefusedPickleError(ValueError):
@@ -208,7 +218,7 @@ class RefusedPickleError(ValueError):
 class _Reader(pickle.Unpickler):
     def find_class(self, module_name, global_name, /):
         try:
-            return _ADMITTED[module_name, global_name]
+            return ADMITTED[module_name, global_name]
         except KeyError:
             raise RefusedPickleError(
                 f"refused: the pickle asks for {module_name}.{global_name}. Only NumPy arrays, "
@@ -227,7 +237,7 @@ def plain(value: Any, max_bytes: int = _MAX_BYTES) -> Any:
     Raises:
         ValueError: it takes more, or contradicts itself.
     """
-    if isinstance(value, _StandIn):
+    if isinstance(value, StandIn):
         return value.as_array(max_bytes)  # pyright: ignore[reportAttributeAccessIssue]
     return value
 

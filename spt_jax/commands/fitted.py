@@ -234,8 +234,8 @@ def write_bodies(
     The poses are in the world of the camera. A camera without a rotation has y down; the meshes are
     turned then, so that viewers show them upright: y up, the camera looking along -z, as in glTF.
     """
-    from spt_jax.body.pose_files import write_poses
     from spt_jax.mesh_files import write_mesh
+    from spt_jax.pose_files import write_poses
 
     names = []
     bodies = [one for one in people if one.overlap is not None]

@@ -1,51 +1,49 @@
 """`spt-jax untangle`: a pose file or a mesh file, freed of self-intersections."""
 
 import json as json_format
-import re
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-import numpy as np
 import tyro
 
 from spt_jax.commands.mesh import untangle_mesh_file
 from spt_jax.commands.terminal import err_console, out_console, progress_bar, show, user_errors
-
-if TYPE_CHECKING:
-    from spt_jax.body import BodyModel
-    from spt_jax.body.pose_files import PoseFile
-    from spt_jax.commands.frames import Motion
 
 
 def untangle(
     poses: tyro.conf.Positional[Path],
     out: Path = Path("untangled"),
     frames: str = "all",
+    people: str = "all",
     body: str = "anny",
     folds: Literal["ignore", "remove", "count"] = "ignore",
     fold_distance: float | None = None,
     meshes: bool = False,
+    like_input: bool = False,
     rays: int | None = None,
     anew: bool = False,
     max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Free the poses of an .npz file from self-intersections, frame by frame, or one mesh file.
+    """Free the poses of a pose file from self-intersections, frame by frame, or one mesh file.
 
-    Takes AMASS files, parameters of SMPL, SMPL-H and SMPL-X, and files that this command wrote.
-    Writes poses.npz (AMASS layout, in the body's joints) and report.json. Each frame that is done
-    is kept in OUT/unfinished until all are: a run that was ended goes on with the same command.
+    Takes the pose files of AMASS, SMPLify-X, PROX, HMR2, PHALP, WHAM, VIBE, PyMAF, GVHMR, TRAM,
+    ROMP, BEV, SLAHMR, BEDLAM, AIST++, 3DPW, MOYO, EasyMocap, MMHuman3D, Motion-X and VPoser, BVH,
+    and files that this command wrote; their suffixes do not matter. Writes poses.npz (AMASS layout,
+    in the body's joints; of several people one file each, poses_NAME.npz) and report.json. Each
+    frame that is done is kept in OUT/unfinished until all are: a run that was ended goes on with
+    the same command.
 
     Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
     in the same format; the exit code is 1 if something still intersects or overlaps.
 
     Args:
-        poses: the pose file, or a mesh file of any other suffix than .npz.
+        poses: the pose file (.npz, .npy, .pkl, .pt, .json, .bvh), or a mesh file.
         out: folder for the results, made where missing.
         frames: which frames: numbers from 0, ranges and names, such as 0,5,10-12 or crawl/0012
+        people: whose frames, of a file of several: names or numbers from 0, such as 0,2
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
             (.npz, .pkl).
         folds: of a posed body, what becomes of skin that folds where a joint bends: "ignore" leaves
@@ -56,6 +54,7 @@ def untangle(
             is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
             0.04 on fingers.
         meshes: write a .glb of each frame before and after, coloured by label.
+        like_input: write NAME_untangled too, the input in its own structure with the new poses.
         rays: how many rays to cast along the longer side of each of three beams; the search uses
             half as many; not given: none, everything is measured exactly.
         anew: throw away what is done of an unfinished run in the folder.
@@ -63,10 +62,14 @@ def untangle(
         json: print the report as JSON in place of the table.
         quiet: print errors alone.
     """
-    if poses.suffix.lower() != ".npz":
+    from spt_jax.pose_files import is_pose_file
+
+    if not is_pose_file(poses):
         with user_errors():
             _refuse_for_mesh(
                 frames=frames != "all",
+                people=people != "all",
+                like_input=like_input,
                 body=body != "anny",
                 folds=folds != "ignore",
                 fold_distance=fold_distance is not None,
@@ -76,17 +79,16 @@ def untangle(
             poses, out, meshes=meshes, rays=rays, max_bytes=max_bytes, json=json, quiet=quiet
         )
     from spt_jax.arguments import as_rays
-    from spt_jax.body.pose_files import read_poses
+    from spt_jax.commands.motions import chosen, motion_of, write_like_input, write_motions
     from spt_jax.exclusions import as_fold_distance
     from spt_jax.output_files import ensure_folder, write_json
 
     with user_errors():
         as_rays(rays)
         as_fold_distance(fold_distance)
-        given = read_poses(poses, max_bytes=max_bytes)
-        rows = select_frames(given.names, frames)
+        asked = chosen(poses, people, frames, max_bytes)
         folder = ensure_folder(out)
-    with progress_bar(len(rows), quiet) as state:
+    with progress_bar(len(asked.rows), quiet) as state:
         state("loading the body")
         from spt_jax.body import load_body
         from spt_jax.commands.frames import (
@@ -97,13 +99,12 @@ def untangle(
             summary,
             untangle_frames,
             write_meshes,
-            write_motion,
         )
         from spt_jax.commands.unfinished import UnfinishedRun, manifest_of
 
         with user_errors():
-            model = load_body(body, num_shape=_num_shape(given), max_bytes=max_bytes)
-        motion, notes = _motion(given, rows, model, body)
+            model = load_body(body, num_shape=asked.num_shape, max_bytes=max_bytes)
+        motion, notes = motion_of(asked, model, body)
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
         options = {
@@ -121,13 +122,20 @@ def untangle(
             done = untangle_frames(
                 model, motion, **options, state=state, run=run, keep_vertices=meshes
             )
-            state("writing", done=len(rows))
+            state("writing", done=len(asked.rows))
             report = as_report("untangle", done, {"poses": str(poses), "body": body, **options})
             with user_errors():
                 written = write_meshes(folder, done, model.faces, (".glb",)) if meshes else []
                 report["meshes"] = written
-                report["notes"] = notes
-                write_motion(folder / "poses.npz", done, motion)
+                report["structure"] = asked.file.structure
+                files = write_motions(folder, done, motion, asked)
+                if like_input:
+                    name, stale = write_like_input(folder, done, motion, asked, model.joint_names)
+                    files.append(name)
+                    for note in stale:
+                        show(err_console(quiet), f"note: {note}", "yellow")
+                    notes += stale
+                report["files"], report["notes"] = files, notes
                 write_json(folder / "report.json", report)
                 run.finish()
     if json:
@@ -138,75 +146,11 @@ def untangle(
     show(console, summary(done))
     show(console, left_out((f.before for f in done), (f.after for f in done)))
     also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
-    show(console, f"in {folder}: poses.npz, report.json{also}")
+    show(console, f"in {folder}: {', '.join(files)}, report.json{also}")
     return 0
 
 
 def _refuse_for_mesh(**used: bool) -> None:
     for name, given in used.items():
         if given:
-            raise ValueError(f"{name} is for pose files (.npz): got it with a mesh; leave it out.")
-
-
-def select_frames(names: Sequence[str], wanted: str) -> list[int]:
-    """Rows of the frames asked for, in that order, each once; all of them for "all".
-
-    Raises:
-        ValueError: something that is neither a name, nor a row, nor a range of rows.
-    """
-    if wanted == "all":
-        return list(range(len(names)))
-    rows: list[int] = []
-    for item in map(str.strip, wanted.split(",")):
-        ends = re.fullmatch(r"(\d+)(?:-(\d+))?", item)
-        if item in names:
-            rows.append(names.index(item))
-            continue
-        first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
-        if not first <= last < len(names):
-            raise ValueError(
-                f"frames must be rows 0 to {len(names) - 1}, ranges of them or names such as "
-                f"{names[0]!r}: got {item!r}; separate several by commas."
-            )
-        rows += range(first, last + 1)
-    return list(dict.fromkeys(rows))
-
-
-def _num_shape(given: "PoseFile") -> int:
-    return 10 if given.shape is None else max(10, given.shape.shape[-1])
-
-
-def _motion(
-    given: "PoseFile", rows: Sequence[int], model: "BodyModel", body: str
-) -> tuple["Motion", list[str]]:
-    """The frames asked for on the body, and what of them had to be left out."""
-    from spt_jax.body.poses import SMPL_LAYOUTS
-    from spt_jax.commands.frames import Motion
-
-    notes = []
-    shape = given.shape
-    if shape is not None and body == "anny":
-        notes.append(
-            "the file's shape is in SMPL's components, which the embedded body does not have; "
-            "its mean shape is used (--body takes an SMPL file)"
-        )
-        shape = None
-    elif shape is not None and shape.shape[-1] > model.num_shape:
-        notes.append(f"shape components after the body's {model.num_shape} are left out")
-        shape = shape[..., : model.num_shape]
-    if shape is not None:
-        shape = np.broadcast_to(shape, (len(given.pose), shape.shape[-1]))[rows]
-    layout = SMPL_LAYOUTS[given.pose.shape[1]]
-    turned = np.any(given.pose[rows], axis=(0, 2)).tolist()
-    lost = [name for name, used in zip(layout, turned, strict=True) if used]
-    lost = [name for name in lost if name not in model.joint_names]
-    if lost:
-        shown = ", ".join(lost[:4]) + (", ..." if len(lost) > 4 else "")
-        notes.append(f"the body lacks {shown}; their rotations are left out")
-    pose = np.asarray(model.pose_from_smpl(given.pose[rows].astype(np.float32)))
-    if shape is not None:
-        shape = shape.astype(np.float32)
-    translation = given.translation
-    if translation is not None:
-        translation = translation[rows].astype(np.float32)
-    return Motion([given.names[row] for row in rows], pose, shape, translation), notes
+            raise ValueError(f"{name} is for pose files: got it with a mesh; leave it out.")

@@ -3,18 +3,18 @@
 import re
 import secrets
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
 
 from spt_jax.body import BodyModel, load_body, load_mocap
-from spt_jax.body.pose_files import PoseFile, read_poses, write_poses
 from spt_jax.body.poses import SMPL_LAYOUTS
-from spt_jax.file_limits import as_file, read_npz
+from spt_jax.file_limits import as_file, read_bytes, read_npz
 from spt_jax.mesh_check import check_mesh
 from spt_jax.mesh_files import read_mesh, write_mesh
+from spt_jax.pose_files import MotionFile, Track, is_pose_file, open_poses, write_poses
 from spt_jax.view.scene import Reading, Scene
 
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}", re.ASCII)
@@ -39,12 +39,12 @@ class Frames:
 
 def open_file(
     path: Path, name: str | None = None, *, max_bytes: int | None = None
-) -> Scene | PoseFile:
+) -> Scene | MotionFile:
     """What a file holds: a mesh or a body as a scene, or poses.
 
     Args:
-        path: .pkl is an SMPL model; .npz one too if it has `v_template`, otherwise poses; anything
-            else is a mesh, which must be closed.
+        path: .pkl and .npz are an SMPL model where they have `v_template`, otherwise poses, as are
+            the other suffixes of pose files; anything else is a mesh, which must be closed.
         name: what a scene is called; the file's name without its suffix if None.
         max_bytes: what the file and its arrays may take once unpacked; 1 GiB where None.
 
@@ -55,16 +55,16 @@ def open_file(
             consistently wound.
     """
     path = as_file(path)  # a pipe would be waited for
-    if path.suffix == ".pkl" or _is_model(path):
+    if _is_model(path, max_bytes):
         return Scene.of_body(load_body(path, max_bytes=max_bytes), name or path.stem)
-    if path.suffix.lower() == ".npz":
-        return read_poses(path, max_bytes=max_bytes)
+    if is_pose_file(path):
+        return open_poses(path, max_bytes=max_bytes)
     vertices, faces = read_mesh(path, max_bytes=max_bytes)
     check_mesh(vertices, faces).raise_if_unfit()
     return Scene.of_mesh(vertices, faces, name or path.stem)
 
 
-def open_upload(name: str, content: bytes, *, max_bytes: int | None = None) -> Scene | PoseFile:
+def open_upload(name: str, content: bytes, *, max_bytes: int | None = None) -> Scene | MotionFile:
     """The same for a file that a browser sent; nothing of it stays on the disk.
 
     On the disk it has a name of our own: of the one that it came with, the suffix says which reader
@@ -84,8 +84,16 @@ def open_upload(name: str, content: bytes, *, max_bytes: int | None = None) -> S
         except (OSError, TypeError, ValueError) as error:
             message = str(error).replace(str(path), label).replace(path.name, label)
             raise ValueError(message.replace(own, title)) from error
-    if isinstance(opened, PoseFile):  # frames without names are called after their file
-        opened = opened._replace(names=[frame.replace(own, title) for frame in opened.names])
+    if isinstance(opened, MotionFile):  # frames without names are called after their file
+        tracks = tuple(
+            replace(
+                track,
+                name=track.name.replace(own, title),
+                names=[frame.replace(own, title) for frame in track.names],
+            )
+            for track in opened.tracks
+        )
+        opened = replace(opened, tracks=tracks)
     return opened
 
 
@@ -102,8 +110,8 @@ def label_of(name: str) -> str:
     return label[-_LONGEST_NAME:] if label.strip(".") else "file"
 
 
-def frames_for(given: PoseFile, body: BodyModel, *, embedded: bool) -> tuple[Frames, list[str]]:
-    """The file's poses on a body, and what of them had to be left out."""
+def frames_for(given: Track, body: BodyModel, *, embedded: bool) -> tuple[Frames, list[str]]:
+    """A track's poses on a body, and what of them had to be left out."""
     notes = []
     shape = given.shape
     if shape is not None and embedded:
@@ -123,6 +131,18 @@ def frames_for(given: PoseFile, body: BodyModel, *, embedded: bool) -> tuple[Fra
         notes.append(f"The body lacks {shown}: their rotations are left out.")
     pose = np.asarray(body.pose_from_smpl(given.pose.astype(np.float32)))
     return Frames(list(given.names), pose, shape, given.translation), notes
+
+
+def motions_of(
+    given: MotionFile, name: str, body: BodyModel, *, embedded: bool
+) -> tuple[dict[str, Frames], list[str]]:
+    """The people of a file on a body, each a motion, and what had to be left out, once each."""
+    motions, notes = {}, list(given.notes)
+    for track in given.tracks:
+        label = name if len(given.tracks) == 1 else f"{name}: {track.name}"
+        motions[label], more = frames_for(track, body, embedded=embedded)
+        notes += more
+    return motions, list(dict.fromkeys(notes))
 
 
 def mocap_for(body: BodyModel) -> dict[str, Frames]:
@@ -161,8 +181,11 @@ def pose_bytes(scene: Scene) -> bytes:
         return path.read_bytes()
 
 
-def _is_model(path: Path) -> bool:
-    return path.suffix.lower() == ".npz" and "v_template" in read_npz(path, _nothing).names
+def _is_model(path: Path, max_bytes: int | None) -> bool:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return "v_template" in read_npz(path, _nothing).names
+    return suffix == ".pkl" and b"v_template" in read_bytes(path, max_bytes=max_bytes)
 
 
 def _nothing(array: str) -> bool:

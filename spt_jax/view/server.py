@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from spt_jax.body import load_body
-from spt_jax.body.pose_files import PoseFile
 from spt_jax.mesh_check import check_mesh
+from spt_jax.pose_files import MotionFile
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
 from spt_jax.view.freeing import untangle_scene
@@ -223,15 +223,19 @@ class View:
     def _take_upload(self, name: str, content: bytes) -> None:
         self._do("open", "open_upload", name, content)
 
-    def _take(self, opened: Scene | PoseFile, name: str | None, *, first: bool) -> None:
+    def _take(self, opened: Scene | MotionFile, name: str | None, *, first: bool) -> None:
         notes: Sequence[str] = ()
-        if isinstance(opened, PoseFile):
+        if isinstance(opened, MotionFile):
             scene = self.scene if not first else _embedded_body()
             if scene.body is None:
                 scene, self._embedded = _embedded_body(), True
-            name = name or "poses"
-            frames, notes = files.frames_for(opened, scene.body, embedded=self._embedded)  # type: ignore
-            motions, start = {name: frames, **files.mocap_for(scene.body)}, (name, 0)  # type: ignore
+            shown, notes = files.motions_of(
+                opened,
+                name or "poses",
+                scene.body,  # type: ignore
+                embedded=self._embedded,
+            )
+            motions, start = {**shown, **files.mocap_for(scene.body)}, (next(iter(shown)), 0)  # type: ignore
         else:
             scene = opened
             self._embedded = name is None
