@@ -33,6 +33,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.keypoints import KeypointRegressor as KeypointRegressor
     from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
     from spt_jax.keypoints import read_keypoints as read_keypoints
+    from spt_jax.pose_files import load_poses as load_poses
     from spt_jax.status import RESULTS as RESULTS
     from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
     from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
@@ -53,6 +54,7 @@ _LATER = {
     "fit_people": "spt_jax.fit.people",
     "fit_pose": "spt_jax.fit.pose",
     "keypoint_regressor": "spt_jax.keypoints",
+    "load_poses": "spt_jax.pose_files",
     "read_keypoints": "spt_jax.keypoints",
     "untangle_mesh": "spt_jax.untangle.mesh",
     "untangle_pose": "spt_jax.untangle.pose",

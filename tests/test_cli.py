@@ -18,7 +18,7 @@ from spt_jax import Step, cli
 from spt_jax.body import load_mocap
 from spt_jax.cli import main
 from spt_jax.commands.demo import DEMO_FRAMES
-from spt_jax.commands.untangle import select_frames
+from spt_jax.commands.motions import select_frames
 from spt_jax.pose_files import read_poses, write_poses
 
 
@@ -298,7 +298,7 @@ def test_untangle_keeps_translation_and_leaves_out_what_the_body_lacks(calls, tm
     pose = np.zeros((2, 55, 3))
     pose[1, 22] = 0.1  # the jaw
     file = tmp_path / "smplx.npz"
-    write_poses(file, pose, shape=np.ones(16), translation=np.array([[1, 2, 3], [4, 5, 6]]))
+    write_poses(file, pose, shape=np.ones(16), translation=np.array([[1.0, 2, 3], [4, 5, 6]]))
     out = tmp_path / "out"
     assert main(["untangle", str(file), "--out", str(out), "--rays", "32", "--frames", "1"]) == 0
     notes = capsys.readouterr().err

@@ -17,7 +17,7 @@ import spt_jax
 DOCS = TOP / "docs"
 PAGES = {str(page.relative_to(DOCS)): page.read_text("utf-8") for page in DOCS.rglob("*.md")}
 #: Those whose programs take less than five seconds of a core.
-QUICK = {"contributing.md", "recipes/smplx.md", "recipes/body-models.md"}
+QUICK = {"contributing.md", "recipes/pose-files.md", "recipes/smplx.md", "recipes/body-models.md"}
 SHOWN = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
     for name, text in sorted(PAGES.items())
@@ -87,6 +87,7 @@ EXPECTED = {
     "recipes/own-body.md": the_worm_is_free,
     "recipes/smplx.md": prints("cm^3 of collisions", "intersecting pairs"),
     "recipes/body-models.md": prints("fit for the penalty", "after"),
+    "recipes/pose-files.md": prints("walk (5, 22, 3) 120.0 female", "free of 52 joints"),
     "recipes/people.md": what_is_between_and_within_adds_up,
     "recipes/keypoints.md": fits,
     "recipes/training-loss.md": the_network_learns_to_collide_less,

@@ -37,6 +37,7 @@ NAMES = [
     "keypoint_regressor",
     "load_body",
     "load_mocap",
+    "load_poses",
     "paper_penalty",
     "read_keypoints",
     "self_intersection_penalty",

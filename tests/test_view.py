@@ -254,7 +254,7 @@ def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
         ("model.pkl", b"not a pickle", "model.pkl"),
         ("mesh.ply", b"ply\nnonsense", "must be a readable .ply file: got 'mesh.ply'"),
         ("notes.txt", b"hello", "got 'notes.txt', which begins like none of them"),
-        ("notes.xyz", b"hello", "one of the suffixes"),
+        ("notes.docx", b"hello", "one of the suffixes"),
         ("../../evil.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "must be closed"),
     ],
 )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spt_jax.commands.untangle import select_frames
+from spt_jax.commands.motions import select_frames
 from spt_jax.file_limits import read_json, read_npz
 
 if TYPE_CHECKING:

@@ -255,6 +255,19 @@ def write_meshes(
     return written
 
 
+def write_motion(path: Path, frames: Sequence[Frame], motion: Motion) -> None:
+    """Write the untangled poses, with the shapes and translations that came with them."""
+    from spt_jax.pose_files import write_poses
+
+    write_poses(
+        path,
+        np.stack([frame.pose for frame in frames]),
+        shape=motion.shape,
+        translation=motion.translation,
+        names=motion.names,
+    )
+
+
 def _file_names(frames: Sequence[Frame]) -> list[str]:
     names = [frame.file_name for frame in frames]
     # "a/b" and "a_b" would share a file.

@@ -141,9 +141,10 @@ def _archive(file: Path, content: bytes, max_bytes: int | None) -> Container:
     with _damage(file):
         archive = zipfile.ZipFile(io.BytesIO(content))
         members = archive.infolist()
-    check_bytes("the members of pose file", file, sum(m.file_size for m in members), max_bytes)
     roots = [m.filename[: -len("data.pkl")] for m in members if m.filename.endswith("/data.pkl")]
     if roots:
+        size = sum(member.file_size for member in members)
+        check_bytes("the members of pose file", file, size, max_bytes)
         with _damage(file):
             value = _torch_archive(file, archive, roots[0], max_bytes)
         return Container(file, "torch", value, as_torch_archive)
@@ -157,7 +158,8 @@ def _archive(file: Path, content: bytes, max_bytes: int | None) -> Container:
         with named_field(name, str(file)):
             shape, _, dtype = array_header(archive, member, len(content), objects=True)
             total += int(np.prod(shape, dtype=object)) * max(dtype.itemsize, 8)
-            check_bytes(f"arrays up to {name} in", file, total, max_bytes)
+            what = f"{name} in" if len(members) == 1 else f"arrays up to {name} in"
+            check_bytes(what, file, total, max_bytes)
             data = archive.read(member)
         tree[name] = _member(file, name, data, max_bytes)
     if not tree:

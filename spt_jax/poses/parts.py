@@ -134,8 +134,9 @@ def _part(
     found = None
     # (3, 3) may be three vectors or one matrix, and which of four numbers is the scalar shows best
     # in many joints: the body says.
-    for some in (frames, None) if form is not None else ():
-        found = found or source.rotations(way, joints, index=index, frames=some, forms=(form,))
+    for some in (frames, None):
+        if form is not None and found is None:
+            found = source.rotations(way, joints, index=index, frames=some, forms=(form,))
     found = found or source.rotations(way, joints, index=index)
     if found is None:
         shape = source.numbers(way, index).shape

@@ -60,7 +60,7 @@ def _names(source: Source, frames: int) -> list[str]:
     way = source.first((), ("name",))
     if way is None:
         return []
-    source.used.add(way)
+    source.used |= {way, ("joints",)}  # this project's own: its joints are SMPL's, in their order
     names = np.atleast_1d(np.asarray(source.get(way)))
     if names.dtype.kind != "U" or names.shape != (frames,):
         raise ValueError(
