@@ -67,11 +67,10 @@ def npz(**arrays):
     return file.getvalue()
 
 
-class _Wrapper:
-    """Stands for joblib's class of this place in a pickle."""
+_Pickler: Any = pickle._Pickler  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class _Joblib(pickle._Pickler):
+class _Joblib(_Pickler):
     """joblib.dump without compression: arrays' bytes stand behind a wrapper that describes them."""
 
     def save(self, obj, save_persistent_id=True):
@@ -99,7 +98,7 @@ def joblib(value, compress: Callable[[bytes], bytes] = bytes):
 _STORAGES = {"f4": "FloatStorage", "f8": "DoubleStorage", "i8": "LongStorage"}
 
 
-class _Torch(pickle._Pickler):
+class _Torch(_Pickler):
     """torch.save's pickle: arrays become tensors, whose numbers stand beside it."""
 
     def __init__(self, file, arrays):

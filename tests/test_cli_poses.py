@@ -13,6 +13,7 @@ from spt_jax.body import load_body
 from spt_jax.cli import main
 from spt_jax.pose_files import MotionFile, load_poses, open_poses
 from spt_jax.view import files
+from spt_jax.view.scene import Scene
 
 
 def written(folder, name):
@@ -120,6 +121,7 @@ def test_the_view_shows_each_person(tmp_path):
 def test_an_uploaded_pose_file_is_called_after_its_own_name(tmp_path):
     content = written(tmp_path, "threedpw").read_bytes()
     opened = files.open_upload("court.pkl", content)
+    assert isinstance(opened, MotionFile)
     assert [track.names[0] for track in opened.tracks] == ["court/0/0000", "court/1/0000"]
 
 
@@ -130,4 +132,5 @@ def test_a_pickled_body_model_is_still_a_body(tmp_path, rng):
 
     model = synthetic_smpl(rng, joints=24)
     (tmp_path / "model.pkl").write_bytes(pickle.dumps(model, protocol=2))
-    assert files.open_file(tmp_path / "model.pkl").body is not None
+    opened = files.open_file(tmp_path / "model.pkl")
+    assert isinstance(opened, Scene) and opened.body is not None
