@@ -12,8 +12,9 @@ import pytest
 from hypothesis import settings
 from jaxtyping import config, install_import_hook
 
-# The same examples on every machine, and no database of them in the tree.
-settings.register_profile("suite", derandomize=True, database=None)
+# The same examples on every machine, no database of them in the tree, and no deadline: how long one
+# takes depends on what else the machine does.
+settings.register_profile("suite", derandomize=True, database=None, deadline=None)
 settings.load_profile("suite")
 
 # Most of the suite's time is compiling, of programs that then run for milliseconds. With these
