@@ -22,6 +22,8 @@ def main() -> None:
     """Answer each line of standard input with [milliseconds, [numbers that tell the result]]."""
     if not str(spt_jax.__file__).startswith(sys.argv[1]):
         sys.exit(f"spt_jax must be imported from {sys.argv[1]}: got {spt_jax.__file__}.")
+    if hasattr(spt_jax, "config"):  # before its first release, processes were always started
+        spt_jax.config.processes = "auto"
     body, mocap = spt_jax.load_body(), spt_jax.load_mocap()
     rows = [mocap.names.index(name) for name in ("crawl/0092", "walk/0010")]
     place = jnp.array([[0.0, 0.0, 0.0], [0.45, 0.0, 0.0]])

@@ -12,7 +12,11 @@ import rich.table
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from spt_jax import config
 from spt_jax.output_files import atomic_write
+
+# Batches are timed as those are measured who ask for it.
+config.processes = "auto"
 
 RESULTS = Path(__file__).with_name("results.md")
 FIGURES = Path(__file__).with_name("figures")

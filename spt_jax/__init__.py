@@ -23,6 +23,7 @@ from spt_jax.report import IntersectionReport as IntersectionReport
 from spt_jax.report import intersection_report as intersection_report
 from spt_jax.rest_surface import RestSurface as RestSurface
 from spt_jax.result import Overlap as Overlap
+from spt_jax.settings import config as config
 
 if typing.TYPE_CHECKING:
     from spt_jax.fit.people import Penetration as Penetration

@@ -70,10 +70,10 @@ def call_on_host(
     vertices: Float[Array | np.ndarray, "*batch V 3"],
     faces: Integer[Array | np.ndarray, "F 3"],
 ) -> tuple[Array, ...]:
-    """Run a NumPy function once per mesh of the batch, in as many processes as there are cores.
+    """Run a NumPy function once per mesh of the batch, in the processes that `config` allows.
 
-    Results of the last meshes are remembered, in 64 MB: a mesh that comes again is not measured
-    again, and neither are equal meshes of one batch. A batch that is sharded over devices stays so.
+    Results are kept in an LRU cache keyed by the vertices' bytes, so that a repeated mesh, also
+    within one batch, is measured once. A batch that is sharded over devices stays so.
 
     Args:
         function: a module-level function, pure.

@@ -11,6 +11,8 @@ from collections.abc import Callable, Hashable, Sequence
 import numpy as np
 from jaxtyping import Integer
 
+from spt_jax.settings import config
+
 Results = tuple[np.ndarray, ...]
 # The vertices of one mesh in their own dtype, and its faces as `Recent.faces` returns them.
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -27,13 +29,14 @@ class Recent:
     An embedded body takes 0.3 MB in float32, so that 200 of them are remembered.
 
     Args:
-        most_bytes: of vertices and results together; the least recently used are forgotten.
+        most_bytes: of vertices and results together; the least recently used are evicted. None: as
+            `spt_jax.config` says.
         most_faces: how many lists of faces are kept, and with them their results.
         most_asked: of how many questions results are kept. Options may be large: groups of faces,
             a rest surface with its table of 50 MB.
     """
 
-    def __init__(self, most_bytes: int = 64 << 20, most_faces: int = 4, most_asked: int = 8):
+    def __init__(self, most_bytes: int | None = None, most_faces: int = 4, most_asked: int = 8):
         self._most_bytes, self._most_faces = most_bytes, most_faces
         self._most_asked = most_asked
         self._lock = threading.Lock()
@@ -129,7 +132,9 @@ class Recent:
                 return
             self._results[key] = results
             self._bytes += _size(key, results)
-            while self._bytes > self._most_bytes:
+            most = self._most_bytes
+            most = config.result_cache_bytes if most is None else most
+            while self._bytes > most:
                 self._bytes -= _size(*self._results.popitem(last=False))
 
     def _drop_all(self, part: int, value: int) -> None:

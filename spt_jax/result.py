@@ -1,10 +1,18 @@
 """What results have in common: JSON, and how they print."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+# Of a batch of poses arrays, of one mesh plain numbers, which have what is used of arrays.
+if TYPE_CHECKING:
+    Numbers: TypeAlias = Array
+    Counts: TypeAlias = Array
+else:
+    Numbers = Float[Array, "*batch"] | float
+    Counts = Int[Array, "*batch"] | int
 
 
 class Result(eqx.Module):
@@ -54,11 +62,11 @@ class Overlap(Result):
         total intersecting pairs  12
     """
 
-    volume: Float[Array, "*batch"] | float
-    total_volume: Float[Array, "*batch"] | float
-    ratio: Float[Array, "*batch"] | float
-    intersecting_pairs: Int[Array, "*batch"] | int
-    total_intersecting_pairs: Int[Array, "*batch"] | int
+    volume: Numbers
+    total_volume: Numbers
+    ratio: Numbers
+    intersecting_pairs: Counts
+    total_intersecting_pairs: Counts
 
     @property
     def is_free(self) -> Bool[np.ndarray, "*batch"] | bool:

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
+from spt_jax.settings import config
 from spt_jax.worker import Function, LateError, LostError, Mesh, Worker, can_start, packed
 
 # Starting one takes a second of a core, and 190 MB while it is there: not before batches have
-# taken as long, and not for every core of a large machine.
+# taken as long.
 _WORTH_STARTING = 1.0
-_MOST_WORKERS = 7
 
 # Triangles in a batch for it to be shared: handing a mesh over costs as much as some 500.
 _WORTH_SHARING = 10_000
@@ -71,7 +71,7 @@ class Pace:
 
 
 class Workers:
-    """The workers of this process, started when batches have been worth it."""
+    """The workers of this process: as many as `config` allows, once batches are worth it."""
 
     def __init__(self):
         self._lock = threading.Lock()
@@ -201,6 +201,7 @@ class Workers:
         return found
 
     def _ready(self, work: bytes, most: int) -> list[Worker]:
+        most = min(most, config.most_processes(usable_cores()))
         with self._lock:
             self._start()
             free, self._free = self._free, []
@@ -216,7 +217,7 @@ class Workers:
         return ready
 
     def _start(self) -> None:
-        most = min(usable_cores() - 1, _MOST_WORKERS)
+        most = config.most_processes(usable_cores())
         if self._closed or self._spent < _WORTH_STARTING or not can_start():
             return
         if len(self._losses) == _MOST_LOSSES:

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 from helpers import join, sphere
 
-from spt_jax import classify_vertices, host, host_side, penalty, self_intersection_penalty, workers
+from spt_jax import (
+    classify_vertices,
+    config,
+    host,
+    host_side,
+    penalty,
+    self_intersection_penalty,
+    workers,
+)
 
 SCRIPTS = Path(__file__).parent / "scripts"
 
@@ -126,6 +134,7 @@ def test_a_single_core_gives_the_same_result(monkeypatch):
     vertices, faces = join(sphere(), sphere(center=(1.1, 0.2, 0.1)))
     batch = jnp.stack([jnp.asarray(vertices * s, "float32") for s in (1.0, 1.1, 1.2)])
     step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=64).sum())
+    monkeypatch.setattr(config, "processes", "auto")
     shared = jax.block_until_ready(step(batch))
     monkeypatch.setattr(workers, "usable_cores", lambda: 1)
     host.forget()

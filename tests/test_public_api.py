@@ -30,6 +30,7 @@ NAMES = [
     "check_mesh",
     "classify_vertices",
     "clear_caches",
+    "config",
     "fit_people",
     "fit_pose",
     "intersection_report",

@@ -205,7 +205,10 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
     np.testing.assert_array_equal(result.pose, swung(2.6))
     assert result.after.volume == result.before.volume and not result.is_free
     assert result.status == RESULTS.nonlinear_divergence and "diverged" in result.reason
-    assert len(seen) >= 5 and any(np.isnan(step.volume) for step in seen)
+    # Its steps are shown as they are: at no surface, or joints turned by more than a full turn.
+    far = [np.linalg.norm(step.pose - swung(2.6), axis=-1).max() for step in seen]
+    assert len(seen) >= 5
+    assert any(np.isnan(step.volume) for step in seen) or max(far) > 2 * np.pi
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from helpers import join, sampling, sphere
 
+from spt_jax import config, workers
 from spt_jax import worker as module
-from spt_jax import workers
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.penalty import _Options, _value_and_gradient_on_host
 from spt_jax.rest_surface import RestSurface
@@ -31,6 +31,7 @@ pytestmark = pytest.mark.skipif(not module.can_start(), reason="no workers on th
 @pytest.fixture(autouse=True)
 def two_cores_and_any_batch(monkeypatch):
     monkeypatch.setattr(workers, "usable_cores", lambda: 2)
+    monkeypatch.setattr(config, "processes", "auto")
     monkeypatch.setattr(workers, "_WORTH_STARTING", 0.0)
     monkeypatch.setattr(workers, "_WORTH_SHARING", 0)
 

@@ -237,7 +237,8 @@ def _status(found: Freed) -> Any:
 
 def _overlap(place: Place) -> Overlap:
     ratio = float(np.mean(place.labels != 0)) if len(place.labels) else 0.0
-    return Overlap(place.volume, place.volume, ratio, place.pairs, place.pairs)
+    numbers: Any = (place.volume, place.volume, ratio, place.pairs, place.pairs)
+    return Overlap(*numbers)
 
 
 def _flipped(before, after, surface: Surface) -> int:

@@ -244,7 +244,9 @@ class _Search(eqx.Module):
         """What is compared and reported is measured with."""
         return 2 * self.rays if isinstance(self.rays, int) else None
 
-    def measure(self, vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Overlap:
+    def measure(
+        self, vertices: Float[Array | np.ndarray, "V 3"], faces: Int[Array, "F 3"]
+    ) -> Overlap:
         """The overlap of a posed body.
 
         Raises:
