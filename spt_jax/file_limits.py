@@ -9,6 +9,7 @@ import json
 import math
 import os
 import struct
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -34,7 +35,7 @@ _LONGEST_HEADER = 10_000
 # RuntimeError's subclass RecursionError stands for a header of nested brackets.
 DAMAGE = (
     *(ValueError, TypeError, KeyError, SyntaxError, EOFError, RuntimeError, OverflowError),
-    *(OSError, struct.error, zipfile.BadZipFile, zlib.error),
+    *(OSError, struct.error, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
 )
 
 
@@ -248,7 +249,7 @@ def read_npz(
     name = os.fspath(path)
     with file_errors(what, file), open(file, "rb") as stream:
         try:
-            archive = zipfile.ZipFile(stream)
+            archive = open_archive(stream)
         except DAMAGE as error:
             raise ValueError(
                 f"{what} must be an .npz archive: got {name!r}, which is none ({error}); it is "
@@ -277,6 +278,21 @@ def read_npz(
     return Npz(arrays, names)
 
 
+def open_archive(stream: Any) -> zipfile.ZipFile:
+    """A zip archive in which every member has the same name both times that it is written.
+
+    Nothing sums up the list of members. A damaged name in it would be one that nobody asks for, and
+    what lies there would be left out without a word.
+
+    Raises:
+        BadZipFile and whatever else of `DAMAGE`: it is none, or is damaged.
+    """
+    archive = zipfile.ZipFile(stream)
+    for member in archive.infolist():
+        archive.open(member).close()
+    return archive
+
+
 def check_archive(
     content: bytes, what: str, path: str | os.PathLike[str], *, max_bytes: int | None = None
 ) -> None:
@@ -288,7 +304,7 @@ def check_archive(
     """
     name = os.fspath(path)
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        with open_archive(io.BytesIO(content)) as archive:
             members = archive.infolist()
     except DAMAGE as error:
         raise ValueError(f"{what} must be a zip archive: got {name!r} ({error}).") from error

@@ -12,6 +12,8 @@ import pytest
 from PIL import Image
 
 from spt_jax.file_limits import TooLargeError, as_file, file_errors, read_bytes, read_json, read_npz
+from spt_jax.keypoints import read_keypoints
+from spt_jax.poses.containers import open_container
 from spt_jax.show.overlay import read_image
 
 
@@ -222,3 +224,26 @@ def test_damaged_images_are_refused_by_name(tmp_path, rng):
                 assert read_image(file).ndim == 3
             except ValueError as error:
                 assert file.name in str(error)
+
+
+@pytest.mark.parametrize("place", ["first letter", "suffix"])
+def test_a_damaged_name_in_the_list_of_members_is_not_passed_over(place, tmp_path):
+    """Scores under a damaged name were left out without a word; the fuzz found it."""
+    path = tmp_path / "a.npz"
+    np.savez(path, keypoints=np.ones((1, 17, 2)), keypoint_scores=np.full((1, 17), 0.5))
+    content = path.read_bytes()
+    at = content.rindex(b"keypoint_scores.npy") + (0 if place == "first letter" else 15)
+    path.write_bytes(content[:at] + b"\0" + content[at + 1 :])
+    for read in (read_npz, read_keypoints, open_container):
+        with pytest.raises(ValueError, match=r"(?s)a\.npz.*File name in directory"):
+            read(path)
+
+
+def test_a_header_that_is_cut_off_within_brackets_is_named(tmp_path):
+    """Python's own tokenizer refuses it, with an error of its own kind."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3L,"
+    header = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("pose.npy", header + b"\0" * 24)
+    with pytest.raises(ValueError, match=r"pose in .*a\.npz"):
+        read_npz(tmp_path / "a.npz")

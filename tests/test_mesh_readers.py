@@ -357,6 +357,7 @@ def test_gltf_that_announces_too_much_or_would_be_read_wrongly(tmp_path):
     }
     outside = {"buffers": [{"byteLength": 4, "uri": "../a.bin"}]}
     missing = {"buffers": [{"byteLength": 4, "uri": "a%20b.bin"}]}
+    packed = {"buffers": [{"byteLength": 4, "uri": "data:application/octet-stream;base1e9,AAAA"}]}
     for content, message in (
         (glb(changed(count=10**9), binary), "announces 12,000,000,000 bytes of a view that has"),
         (glb(unfilled(), binary), "must not take more than 1,073,741,824 bytes: got 12,0"),
@@ -367,6 +368,7 @@ def test_gltf_that_announces_too_much_or_would_be_read_wrongly(tmp_path):
         (glb(tree | gpu, binary), "EXT_mesh_gpu_instancing"),
         (glb(tree | outside, binary), "buffer 0 must lie beside it"),
         (glb(tree | missing, binary), "buffer 0 is missing: 'a%20b.bin'"),
+        (glb(tree | packed, binary), "buffer 0 must be in base64: got 'data:"),
         (glb(tree, binary)[:200], "announces .* bytes and has 200; it is cut"),
         (b"glTF" + struct.pack("<I", 1) + bytes(20), "it is glTF 1"),
         (b"[" * 99_999, 'must begin with "glTF"'),

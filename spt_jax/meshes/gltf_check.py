@@ -132,7 +132,10 @@ def _check_buffers(tree: dict[str, Any], path: Path, max_bytes: int | None) -> N
         if uri is None:
             continue
         if uri.startswith("data:"):
-            there = len(base64.b64decode(uri.partition(",")[2]))
+            kind, _, text = uri.partition(",")
+            if not kind.endswith(";base64"):  # trimesh would look for a file of this name
+                raise UnreadableError(f"buffer {number} must be in base64: got {kind[:80]!r}")
+            there = len(base64.b64decode(text))
         else:
             file = (folder / unquote(uri)).resolve()
             if "://" in uri or not file.is_relative_to(folder):

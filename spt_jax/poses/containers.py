@@ -28,6 +28,7 @@ from spt_jax.file_limits import (
     file_errors,
     named_field,
     npy_header,
+    open_archive,
     parse_json,
     read_bytes,
 )
@@ -139,7 +140,7 @@ def _unpacked(file: Path, content: bytes, max_bytes: int | None) -> bytes:
 
 def _archive(file: Path, content: bytes, max_bytes: int | None) -> Container:
     with _damage(file):
-        archive = zipfile.ZipFile(io.BytesIO(content))
+        archive = open_archive(io.BytesIO(content))
         members = archive.infolist()
     roots = [m.filename[: -len("data.pkl")] for m in members if m.filename.endswith("/data.pkl")]
     if roots:

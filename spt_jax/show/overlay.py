@@ -131,7 +131,8 @@ def read_image(
                 width, height = image.size
                 check_bytes("image", path, 3 * width * height, max_bytes)
                 # Annotators saw the photograph upright, so keypoints count from its upright corner.
-                return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+                ImageOps.exif_transpose(image, in_place=True)
+                return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
         except (TooLargeError, MemoryError):
             raise
         except Exception as error:  # each of Pillow's readers fails in its own way
