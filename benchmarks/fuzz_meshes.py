@@ -17,7 +17,9 @@ import trimesh
 from jaxtyping import Float, Int
 
 from spt_jax.arguments import as_directions
+from spt_jax.overlap.exclusions import NOTHING
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
+from spt_jax.penalty import _Options, _value_and_gradient_on_host
 
 KINDS = ("general position", "contact", "coplanar", "duplicated", "sliver", "nested", "open")
 # Relative to the cube of the size, and for laws to the sum of the magnitudes that cancel.
@@ -60,11 +62,12 @@ def check(seed: int, number: int) -> tuple[str, str, list[str]]:
     unit = 2.0 ** np.frexp(np.ptp(vertices, axis=0).max())[1]
     value, gradient, points = value / unit**3, gradient / unit**2, vertices / unit
     faults = _broken_laws(value, gradient, points)
+    faults += _broken_as_returned(vertices, faces, dtype)
     if kind != "open":
         if not found.exact:
             faults.append("a ray was cast")
         truth = _truth([replace(s, vertices=s.vertices / unit) for s in solids])
-        if abs(value - truth) > _OFF[dtype]:
+        if truth is not None and abs(value - truth) > _OFF[dtype]:
             faults.append(f"value {value:.12g} where {truth:.12g} is right")
         faults += _changes_when_rewritten(rng, value, gradient, points, faces, dtype)
     return kind, dtype, faults
@@ -81,8 +84,6 @@ def _broken_laws(value, gradient, points) -> list[str]:
     faults = []
     if value < 0:
         faults.append(f"a negative value, {value:.3g}")
-    if value == 0 and np.abs(gradient).max() > _LAW:  # less is rounding, which the penalty drops
-        faults.append(f"value 0 with a gradient of {np.abs(gradient).max():.3g}")
     # About the middle, where a mesh far from the origin loses no digits.
     arms = points - (points.max(axis=0) + points.min(axis=0)) / 2
     most = np.abs(gradient).sum() + _LAW
@@ -93,6 +94,18 @@ def _broken_laws(value, gradient, points) -> list[str]:
         if off > _LAW * max(most, 1.0):
             faults.append(f"{what} of the gradient is {off:.3g} of {most:.3g}")
     return faults
+
+
+def _broken_as_returned(vertices, faces, dtype: str) -> list[str]:
+    """What the penalty makes of it: in contact the sums have a slope from one side beside a 0."""
+    options = _Options("volume", "boundary", "vertex", _SAMPLING, NOTHING, np.finfo(dtype).eps)
+    value, gradient = _value_and_gradient_on_host(vertices, faces, options)
+    if np.isnan(value) or value == 0:
+        if np.any(gradient):
+            return [f"the penalty is {value} with a gradient of {np.abs(gradient).max():.3g}"]
+    elif not (value >= np.finfo(dtype).tiny and np.isfinite(gradient.astype(dtype)).all()):
+        return [f"the penalty is {value}, or its gradient overflows"]
+    return []
 
 
 def _changes_when_rewritten(rng, value, gradient, points, faces, dtype) -> list[str]:
@@ -118,16 +131,22 @@ def _changes_when_rewritten(rng, value, gradient, points, faces, dtype) -> list[
     return []
 
 
-def _truth(solids: list[Solid]) -> float:
-    """E, exactly for boxes along the axes and by manifold3d for others."""
+def _truth(solids: list[Solid]) -> float | None:
+    """E, exactly for boxes along the axes and by manifold3d for others.
+
+    None where manifold3d does not give for A and B what it gives for B and A, as it did for one of
+    13,000 triples of boxes with flush sides.
+    """
     if all(solid.aligned for solid in solids):
         boxes = [_box_of(solid) for solid in solids]
         return _summed(solids, lambda i, j: _shared_of_boxes(boxes[i], boxes[j]))
     others = [_manifold_of(solid) for solid in solids]
-    return _summed(
-        solids,
-        lambda i, j: Fraction((others[i] if i == j else others[i] ^ others[j]).volume()),
-    )
+
+    def shared(i: int, j: int) -> Fraction:
+        return Fraction((others[i] if i == j else others[i] ^ others[j]).volume())
+
+    there, back = (_summed(solids, way) for way in (shared, lambda i, j: shared(j, i)))
+    return there if abs(there - back) < _OFF["float64"] else None
 
 
 def _summed(solids: list[Solid], shared: Callable[[int, int], Fraction]) -> float:
