@@ -8,6 +8,7 @@ import base64
 import io
 import json
 import pickle
+import runpy
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,13 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from spt_jax.body import load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.keypoints import read_keypoints
 from spt_jax.mesh_files import read_mesh
-from spt_jax.pose_files import read_poses
+from spt_jax.pose_files import load_poses, read_poses
 from spt_jax.show.overlay import read_image
+
+# The tests' own writers: a module beside no package, so that it is found by its path.
+_HELPERS = Path(__file__).parents[1] / "tests" / "helpers_poses.py"
+MADE: dict[str, Callable[[], Any]] = runpy.run_path(str(_HELPERS), run_name="helpers_poses")["MADE"]
 
 Arrays = list[np.ndarray]
 Generator = np.random.Generator
@@ -45,6 +51,7 @@ class Format(NamedTuple):
         text: whether it has lines, the last of which may be cut without a trace.
         counted: whether it says how much there is of it.
         summed: whether checksums guard all of its bytes.
+        close: how far from what was written what is read may be, in each number.
     """
 
     suffix: str
@@ -53,6 +60,7 @@ class Format(NamedTuple):
     text: bool = False
     counted: bool = True
     summed: bool = False
+    close: float = 0.0
 
 
 # Meshes: what counts is the corners of each triangle, in order.
@@ -367,6 +375,47 @@ def _image(rng: Generator) -> Written:
     return Written(file.getvalue(), [picture])
 
 
+# Poses in every structure, as the tests make them.
+
+
+def _of_structure(name: str) -> Format:
+    """A structure's file, in another order or protocol where that means the same."""
+    one = MADE[name]()
+    truth = [_matrices(pose) for pose in one.poses.values()]
+    npz, plain = one.suffix == ".npz", one.suffix == ".pkl" and b"joblib" not in one.content[:300]
+
+    def write(rng: Generator) -> Written:
+        if npz:
+            with np.load(io.BytesIO(one.content), allow_pickle=True) as archive:
+                arrays = dict(archive)
+            return Written(as_npz(rng, arrays), truth, arrays)
+        if one.suffix == ".json":
+            value = json.loads(one.content)
+            return Written(as_json(rng, value), truth, value)
+        if plain and one.content[:1] == b"\x80":
+            value = pickle.loads(one.content)
+            return Written(as_pickle(rng, value), truth, value)
+        return Written(one.content, truth)
+
+    packed = npz or one.suffix == ".pt" or one.content[:1] == b"\x78"
+    text = one.suffix == ".bvh"
+    return Format(one.suffix, write, _read_tracks, text=text, summed=packed, close=1e-6)
+
+
+def _matrices(pose: np.ndarray) -> np.ndarray:
+    flat = Rotation.from_rotvec(pose.reshape(-1, 3)).as_matrix()
+    return flat.reshape(*pose.shape, 3)
+
+
+def _read_tracks(path: Path) -> Arrays:
+    tracks = load_poses(path)
+    for track in tracks:  # whatever else is read is finite and of a size that goes with the poses
+        for array in (track.translation, track.shape, track.expression, track.left_hand):
+            if array is not None and not np.isfinite(array).all():
+                return [array]
+    return [_matrices(track.pose) for track in tracks]
+
+
 FORMATS = {
     "OBJ": Format(".obj", _obj, read_corners, text=True, counted=False),
     "OFF": Format(".off", _off, read_corners, text=True),
@@ -375,6 +424,7 @@ FORMATS = {
     "GLB": Format(".glb", _glb, read_corners),
     "glTF": Format(".gltf", _gltf_text, read_corners),
     "poses, npz": Format(".npz", _poses, _read_poses, summed=True),
+    **{f"poses, {name}": _of_structure(name) for name in MADE},
     "body, npz": Format(".npz", _body_npz, _read_body, summed=True),
     "body, pickle": Format(".pkl", _body_pkl, _read_body),
     "keypoints, JSON": Format(".json", _keypoints, _read_keypoints),

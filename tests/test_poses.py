@@ -389,5 +389,21 @@ def test_pickles_written_are_read_by_an_older_numpy(tmp_path):
         np.testing.assert_equal(plain, opened.container.tree)
 
 
+def test_what_python_2_wrote_is_read_without_a_warning(tmp_path):
+    """Its NumPy wrote 0 and 1 in a dtype, and strings where there are bytes now."""
+    pose = np.zeros((2, 72))
+    content = pickle.dumps({"smpl_poses": pose}, protocol=0)
+    content = content.replace(b"I00\n", b"I0\n").replace(b"I01\n", b"I1\n")
+    assert b"I0\n" in content and content[:1] == b"("
+    (tmp_path / "x.pkl").write_bytes(content)
+    np.testing.assert_array_equal(load_poses(tmp_path / "x.pkl")[0].pose, pose.reshape(2, 24, 3))
+
+
+def test_a_number_of_any_length_is_refused_in_one_line(tmp_path):
+    (tmp_path / "x.json").write_text('{"global_orient": [1' + "0" * 400 + '], "body_pose": []}')
+    with pytest.raises(ValueError, match=r"body_pose must hold|global_orient must hold numbers"):
+        load_poses(tmp_path / "x.json")
+
+
 def test_refusals_are_of_one_kind():
     assert issubclass(RefusedPickleError, ValueError)

@@ -16,6 +16,7 @@ import math
 import os
 import pickle
 import pickletools
+import warnings
 from collections import OrderedDict
 from typing import Any
 
@@ -338,7 +339,11 @@ def read_pickle(path: str | os.PathLike[str], content: bytes | None = None) -> d
     try:
         _check_memo(content)
         # Latin-1 keeps the bytes of Python 2's strings, in which its arrays are stored.
-        value = _Reader(io.BytesIO(content), encoding="latin1").load()
+        with warnings.catch_warnings():
+            # Python 2's NumPy wrote 0 and 1 for what NumPy 2 wants to be False and True.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            warnings.simplefilter("ignore", UserWarning)
+            value = _Reader(io.BytesIO(content), encoding="latin1").load()
     except RefusedPickleError as error:
         raise RefusedPickleError(f"{os.fspath(path)}: {error}") from None
     except Exception as error:

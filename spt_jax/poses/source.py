@@ -93,7 +93,7 @@ class Source:
                 f"{name} must hold an entry {index}: got shape {array.shape} in {self.file!r}; the "
                 "file contradicts itself"
             ) from None
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             numbers = np.asarray(array, np.float64)
         within = np.abs(numbers) <= most
         if not within.all():
@@ -117,7 +117,7 @@ class Source:
                     *array.shape, *np.shape(np.ravel(array)[0])
                 )
             return array
-        except (TypeError, ValueError, IndexError) as error:
+        except (TypeError, ValueError, IndexError, OverflowError) as error:
             raise ValueError(
                 f"{name} must hold numbers: got other things, or rows of different lengths, in "
                 f"{self.file!r} ({' '.join(str(error).split())[:80]})"

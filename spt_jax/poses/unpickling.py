@@ -11,6 +11,7 @@ import math
 import os
 import pickle
 import struct
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -236,7 +237,11 @@ def unpickled(
     """
     limit = MAX_BYTES if max_bytes is None else max_bytes
     try:
-        return Reader(io.BytesIO(content), limit, storage).load()
+        with warnings.catch_warnings():
+            # Python 2's NumPy wrote 0 and 1 for what NumPy 2 wants to be False and True.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            warnings.simplefilter("ignore", UserWarning)
+            return Reader(io.BytesIO(content), limit, storage).load()
     except RefusedPickleError as error:
         raise RefusedPickleError(
             f"pose file {os.fspath(path)!r} must hold plain data: {error}; convert it to .npz "
