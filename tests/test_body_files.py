@@ -373,3 +373,20 @@ def test_sizes_that_a_pickle_announces_are_not_believed(tmp_path, rng):
     path.write_bytes(_pickled(rng))
     with pytest.raises(ValueError, match=r"model file .*model\.pkl' must not take more than 99"):
         load_body(path, max_bytes=99)
+
+
+def test_an_array_of_objects_that_announces_more_than_it_has_is_refused(tmp_path):
+    """NumPy would read beyond the list's end: a crash of the process, not an error."""
+    content = pickle.dumps({"f": np.array([None] * 3, object)}, protocol=2)
+    damaged = content.replace(b"K\x03\x85", b"J\xff\xff\xff\x1f\x85")
+    assert damaged != content
+    (tmp_path / "x.pkl").write_bytes(damaged)
+    with pytest.raises(ValueError, match=r"x\.pkl cannot be read.*has 3 objects"):
+        read_pickle(tmp_path / "x.pkl")
+
+
+def test_an_array_is_not_made_by_its_class(tmp_path):
+    """`numpy.ndarray((2**40,))` would be a terabyte."""
+    (tmp_path / "x.pkl").write_bytes(b"cnumpy\nndarray\n((L1099511627776L\ntt\x52.")
+    with pytest.raises(ValueError, match=r"x\.pkl cannot be read"):
+        read_pickle(tmp_path / "x.pkl")

@@ -12,13 +12,19 @@ import os
 import pickle
 import struct
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from spt_jax.body.pickles import ADMITTED, Admitted, NumpyArrayName, RefusedPickleError, StandIn
+from spt_jax.body.pickles import (
+    ADMITTED,
+    Admitted,
+    GuardedUnpickler,
+    NumpyArrayName,
+    RefusedPickleError,
+    StandIn,
+)
 from spt_jax.file_limits import MAX_BYTES, TooLargeError, check_bytes
 
 STORAGES = {
@@ -123,12 +129,8 @@ def _admitted(max_bytes: int) -> dict[tuple[str, str], Any]:
     return ADMITTED | table
 
 
-# In Python alone: it is read object by object, so that what stands between them can be read too.
-_Unpickler: Any = pickle._Unpickler  # pyright: ignore[reportAttributeAccessIssue]
-
-
-class Reader(_Unpickler):
-    """Python's own unpickler, which lets what follows an object be read, with our names alone.
+class Reader(GuardedUnpickler):
+    """The guarded unpickler with the names of results, which reads what stands between objects.
 
     Args:
         stream: the content.
@@ -136,7 +138,7 @@ class Reader(_Unpickler):
         storage: returns a storage that a persistent id names, as an array.
     """
 
-    dispatch: ClassVar = dict(_Unpickler.dispatch)
+    dispatch: ClassVar = dict(GuardedUnpickler.dispatch)
 
     def __init__(
         self,
@@ -144,21 +146,9 @@ class Reader(_Unpickler):
         max_bytes: int,
         storage: Callable[[Any], np.ndarray] | None = None,
     ):
-        # Latin-1 keeps the bytes of Python 2's strings, in which its arrays are stored.
-        super().__init__(stream, encoding="latin1")
-        self._stream, self._max_bytes, self._storage = stream, max_bytes, storage
-        self._names = _admitted(max_bytes)
-
-    def find_class(self, module: str, name: str) -> Any:
-        """The stand-in of a name that is admitted."""
-        try:
-            return self._names[module, name]
-        except KeyError:
-            raise RefusedPickleError(
-                f"refused: the pickle asks for {module}.{name}. Only NumPy arrays, PyTorch's "
-                "tensors, SciPy's sparse matrices, chumpy's arrays and plain containers are read; "
-                "nothing was run"
-            ) from None
+        read = "arrays of NumPy, PyTorch, SciPy and chumpy, and plain containers,"
+        super().__init__(stream, _admitted(max_bytes), read)
+        self._max_bytes, self._storage = max_bytes, storage
 
     def persistent_load(self, pid: Any) -> Any:
         """The storage that an id names."""
@@ -167,26 +157,12 @@ class Reader(_Unpickler):
         return self._storage(pid)
 
     def load_build(self) -> None:
-        """Python's, once the array that it fills has what it announces; then joblib's bytes."""
-        target = self.stack[-2]
-        if not isinstance(target, StandIn | np.ndarray | np.dtype | OrderedDict):
-            raise TypeError(f"it gives a state to {type(target).__name__}")
-        if isinstance(target, np.ndarray):
-            _check_state(self.stack[-1])
+        """The guarded one, and then the bytes that follow one of joblib's arrays."""
         super().load_build()
-        if isinstance(target, _JoblibArray):
-            self.stack[-1] = self._joblib_array(target.state)
+        if isinstance(self.stack[-1], _JoblibArray):
+            self.stack[-1] = self._joblib_array(self.stack[-1].state)
 
     dispatch[pickle.BUILD[0]] = load_build
-
-    def load_bytearray8(self) -> None:
-        """Python's, which would allocate whatever is announced."""
-        (length,) = struct.unpack("<Q", self.read(8))
-        if length > len(self._stream.getbuffer()):  # frames are read ahead of what is left
-            raise ValueError(f"it announces {length:,} bytes")
-        self.append(bytearray(self.read(length)))
-
-    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
 
     def _left(self) -> int:
         return len(self._stream.getbuffer()) - self._stream.tell()
@@ -207,13 +183,6 @@ class Reader(_Unpickler):
         content = self._stream.read(math.prod(shape) * dtype.itemsize)
         flat = np.frombuffer(bytearray(content), dtype)
         return flat.reshape(shape[::-1]).T if state["order"] == "F" else flat.reshape(shape)
-
-
-def _check_state(state: Any) -> None:
-    """Raise where an array of objects announces more of them than it has."""
-    _, shape, dtype, _, content = state if len(state) == 5 else (0, *state)
-    if dtype.hasobject and math.prod(map(int, shape)) != len(content):
-        raise ValueError(f"an array announces the shape {shape} and has {len(content)} objects")
 
 
 def unpickled(
@@ -244,8 +213,8 @@ def unpickled(
             return Reader(io.BytesIO(content), limit, storage).load()
     except RefusedPickleError as error:
         raise RefusedPickleError(
-            f"pose file {os.fspath(path)!r} must hold plain data: {error}; convert it to .npz "
-            "where it was made."
+            f"pose file {os.fspath(path)!r} must hold plain data: {error}"
+            " Convert it to .npz where it was made."
         ) from None
     except (TooLargeError, MemoryError, RecursionError):
         raise
