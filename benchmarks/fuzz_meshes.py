@@ -98,7 +98,9 @@ def _broken_laws(value, gradient, points) -> list[str]:
 
 def _broken_as_returned(vertices, faces, dtype: str) -> list[str]:
     """What the penalty makes of it: in contact the sums have a slope from one side beside a 0."""
-    options = _Options("volume", "boundary", "vertex", _SAMPLING, NOTHING, np.finfo(dtype).eps)
+    options = _Options(
+        "volume", "boundary", "vertex", _SAMPLING, NOTHING, float(np.finfo(dtype).eps)
+    )
     value, gradient = _value_and_gradient_on_host(vertices, faces, options)
     if np.isnan(value) or value == 0:
         if np.any(gradient):

@@ -50,7 +50,7 @@ class Frame(NamedTuple):
     steps: int
     seconds: float
     finite: bool
-    free: bool
+    is_free: bool
     reason: str
 
 
@@ -83,7 +83,7 @@ def untangled(index: int) -> tuple[Frame, np.ndarray, np.ndarray]:
         steps=int(result.steps),
         seconds=seconds,
         finite=bool(np.isfinite(freed).all() and np.isfinite(np.asarray(result.pose)).all()),
-        free=bool(result.is_free),
+        is_free=bool(result.is_free),
         reason=result.reason,
     )
     return frame._replace(after=frame.before if frame.after < 0 else frame.after), vertices, freed
