@@ -1,6 +1,6 @@
 """A self-intersection penalty for triangle meshes and body models in JAX."""
 
-import importlib
+import importlib.metadata
 import typing
 
 from spt_jax.body import BodyModel as BodyModel
@@ -9,12 +9,14 @@ from spt_jax.body import load_body as load_body
 from spt_jax.body import load_mocap as load_mocap
 from spt_jax.caches import clear_caches as clear_caches
 from spt_jax.camera import PinholeCamera as PinholeCamera
+from spt_jax.geometry import inflate as inflate
 from spt_jax.groups import Scene as Scene
 from spt_jax.groups import between_groups as between_groups
 from spt_jax.groups import join_bodies as join_bodies
 from spt_jax.groups import within_groups as within_groups
 from spt_jax.labels import VertexLabels as VertexLabels
 from spt_jax.labels import classify_vertices as classify_vertices
+from spt_jax.lazy import lazy_names
 from spt_jax.mesh_check import MeshCheck as MeshCheck
 from spt_jax.mesh_check import check_mesh as check_mesh
 from spt_jax.penalty import paper_penalty as paper_penalty
@@ -26,6 +28,11 @@ from spt_jax.result import Overlap as Overlap
 from spt_jax.settings import config as config
 
 if typing.TYPE_CHECKING:
+    from spt_jax import fit as fit
+    from spt_jax import io as io
+    from spt_jax import keypoints as keypoints
+    from spt_jax import show as show
+    from spt_jax import xla as xla
     from spt_jax.fit.people import Penetration as Penetration
     from spt_jax.fit.people import PeopleResult as PeopleResult
     from spt_jax.fit.people import fit_people as fit_people
@@ -42,33 +49,76 @@ if typing.TYPE_CHECKING:
     from spt_jax.untangle.pose import untangle_pose as untangle_pose
     from spt_jax.untangle.steps import Step as Step
 
+try:
+    __version__ = importlib.metadata.version("spt-jax")
+except importlib.metadata.PackageNotFoundError:  # run from a folder of sources
+    __version__ = "0+unknown"
+
+__all__ = [
+    "RESULTS",
+    "BodyModel",
+    "FitResult",
+    "IntersectionReport",
+    "KeypointRegressor",
+    "MeshCheck",
+    "Overlap",
+    "Penetration",
+    "PeopleResult",
+    "PinholeCamera",
+    "PosedBody",
+    "RestSurface",
+    "Scene",
+    "Step",
+    "UntangleMeshResult",
+    "UntangleResult",
+    "VertexLabels",
+    "__version__",
+    "between_groups",
+    "check_mesh",
+    "classify_vertices",
+    "clear_caches",
+    "config",
+    "fit_people",
+    "fit_pose",
+    "inflate",
+    "intersection_report",
+    "join_bodies",
+    "keypoint_regressor",
+    "load_body",
+    "load_mocap",
+    "load_poses",
+    "paper_penalty",
+    "read_keypoints",
+    "self_intersection_penalty",
+    "untangle_mesh",
+    "untangle_pose",
+    "within_groups",
+]
+
 # Imported when they are first asked for: who only calls the penalty does not wait for optimistix.
-_LATER = {
-    "FitResult": "spt_jax.fit.result",
-    "KeypointRegressor": "spt_jax.keypoints",
-    "Penetration": "spt_jax.fit.people",
-    "PeopleResult": "spt_jax.fit.people",
-    "RESULTS": "spt_jax.status",
-    "Step": "spt_jax.untangle.steps",
-    "UntangleMeshResult": "spt_jax.untangle.mesh",
-    "UntangleResult": "spt_jax.untangle.pose",
-    "fit_people": "spt_jax.fit.people",
-    "fit_pose": "spt_jax.fit.pose",
-    "keypoint_regressor": "spt_jax.keypoints",
-    "load_poses": "spt_jax.pose_files",
-    "read_keypoints": "spt_jax.keypoints",
-    "untangle_mesh": "spt_jax.untangle.mesh",
-    "untangle_pose": "spt_jax.untangle.pose",
-}
-
-
-def __getattr__(name: str) -> typing.Any:
-    if name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(importlib.import_module(_LATER[name]), name)
-    globals()[name] = found
-    return found
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LATER})
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "FitResult": "spt_jax.fit.result",
+        "KeypointRegressor": "spt_jax.keypoints",
+        "Penetration": "spt_jax.fit.people",
+        "PeopleResult": "spt_jax.fit.people",
+        "RESULTS": "spt_jax.status",
+        "Step": "spt_jax.untangle.steps",
+        "UntangleMeshResult": "spt_jax.untangle.mesh",
+        "UntangleResult": "spt_jax.untangle.pose",
+        "fit_people": "spt_jax.fit.people",
+        "fit_pose": "spt_jax.fit.pose",
+        "keypoint_regressor": "spt_jax.keypoints",
+        "load_poses": "spt_jax.pose_files",
+        "read_keypoints": "spt_jax.keypoints",
+        "untangle_mesh": "spt_jax.untangle.mesh",
+        "untangle_pose": "spt_jax.untangle.pose",
+        # The namespaces.
+        "fit": "",
+        "io": "",
+        "keypoints": "",
+        "show": "",
+        "xla": "",
+    },
+)

@@ -78,7 +78,7 @@ def self_intersection_penalty(
             sampled volume; with several, crossings are weighed by how well their direction sees the
             triangle, which is closer to the limit of many rays.
         margin: how far apart sheets shall be, in the vertices' unit. What is measured is the
-            surface moved outwards by half of it, `spt_jax.geometry.inflate`: where that no longer
+            surface moved outwards by half of it, `spt_jax.inflate`: where that no longer
             overlaps, value and gradient are zero and sheets that face each other are `margin`
             apart. Concave creases narrower than the margin fold when moved, and count.
         face_groups: a whole number for each triangle: its body part or person
@@ -95,7 +95,7 @@ def self_intersection_penalty(
             limbs, not at all for the crease of an elbow. The fraction is differentiated too. Parts
             that are enclosed in each other at rest, as eyeballs in a head, do not count. None:
             every overlap counts.
-        backend: "numpy": on the host; "xla", or `spt_jax.device.settings.Xla` with the sizes of its
+        backend: "numpy": on the host; "xla", or `spt_jax.xla.Xla` with the sizes of its
             arrays: in JAX alone, where the vertices are; "auto": "numpy", also where JAX runs on a
             GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and tells
             folds and groups by what the rays meet (`spt_jax.device`; `python -m benchmarks.device`

@@ -1,5 +1,6 @@
 """The public names and signatures; a change here is a change for every user."""
 
+import importlib.metadata
 import inspect
 import subprocess
 import sys
@@ -33,6 +34,7 @@ NAMES = [
     "config",
     "fit_people",
     "fit_pose",
+    "inflate",
     "intersection_report",
     "join_bodies",
     "keypoint_regressor",
@@ -93,7 +95,9 @@ def test_names():
         for name in dir(spt_jax)
         if not name.startswith("_") and not inspect.ismodule(getattr(spt_jax, name))
     ]
+    public.remove("lazy_names")
     assert sorted(public) == NAMES
+    assert sorted(spt_jax.__all__) == sorted([*NAMES, "__version__"])
     with pytest.raises(AttributeError, match="no attribute 'fit_pse'"):
         _ = spt_jax.fit_pse
 
@@ -115,3 +119,57 @@ def test_everything_public_is_documented():
     for name in PARAMETERS | SHORT:
         doc = inspect.getdoc(getattr(spt_jax, name)) or ""
         assert "Example:" in doc and (name in SHORT or "Returns:" in doc), name
+
+
+NAMESPACES = {
+    "fit": [
+        "BodySpheres",
+        "FitResult",
+        "GaussianPosePrior",
+        "JointLimits",
+        "Laplacian",
+        "Penetration",
+        "PeopleResult",
+        "Regulariser",
+        "SelfIntersection",
+        "Spheres",
+        "Variables",
+        "as_weights",
+        "fit_people",
+        "fit_pose",
+        "joint_limits",
+        "pose_prior",
+    ],
+    "io": [
+        "KeypointFile",
+        "MeshFile",
+        "MotionFile",
+        "RefusedPickleError",
+        "Track",
+        "load_body",
+        "load_poses",
+        "open_mesh",
+        "open_poses",
+        "read_keypoints",
+        "read_mesh",
+        "read_poses",
+        "write_mesh",
+        "write_poses",
+    ],
+    "xla": ["Xla", "device_usage"],
+}
+
+
+@pytest.mark.parametrize("namespace", NAMESPACES)
+def test_namespaces(namespace):
+    """They are there without an import of their own, and nothing in them is undocumented."""
+    module = getattr(spt_jax, namespace)
+    assert module.__all__ == NAMESPACES[namespace]
+    for name in module.__all__:
+        assert name in dir(module) and inspect.getdoc(getattr(module, name)), name
+
+
+def test_all_of_it_can_be_imported_at_once_and_has_a_version():
+    code = "from spt_jax import *; print(untangle_pose.__name__, __version__)"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert printed.stdout.split() == ["untangle_pose", importlib.metadata.version("spt-jax")]

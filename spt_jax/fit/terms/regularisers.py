@@ -56,8 +56,8 @@ class Regulariser(eqx.Module):
     Example:
         >>> import equinox as eqx, jax, jax.numpy as jnp
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.figure import Variables
-        >>> from spt_jax.fit.terms.regularisers import Regulariser, as_weights
+        >>> from spt_jax.fit import Variables
+        >>> from spt_jax.fit import Regulariser, as_weights
         >>> class Still(Regulariser):
         ...     name = "still"
         ...     weights: jax.Array = eqx.field(converter=as_weights, default=(1.0, 10.0))
@@ -122,8 +122,8 @@ class SelfIntersection(Regulariser):
     Example:
         >>> import jax.numpy as jnp
         >>> from spt_jax import load_body, load_mocap
-        >>> from spt_jax.fit.figure import Variables
-        >>> from spt_jax.fit.terms.regularisers import SelfIntersection
+        >>> from spt_jax.fit import Variables
+        >>> from spt_jax.fit import SelfIntersection
         >>> body, mocap = load_body(), load_mocap()
         >>> pose = body.pose_from_smpl(jnp.asarray(mocap.pose[mocap.names.index("punch/0017")]))
         >>> person = Variables(pose[None], jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3)))
@@ -191,8 +191,8 @@ class Spheres(Regulariser):
     Example:
         >>> import jax.numpy as jnp
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.figure import Variables
-        >>> from spt_jax.fit.terms.regularisers import Spheres
+        >>> from spt_jax.fit import Variables
+        >>> from spt_jax.fit import Spheres
         >>> body = load_body()
         >>> shape, translation = jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3))
         >>> rest = Variables(jnp.zeros((1, body.num_joints, 3)), shape, translation)
@@ -232,8 +232,8 @@ class Laplacian(Regulariser):
     Example:
         >>> import jax.numpy as jnp
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.figure import Variables
-        >>> from spt_jax.fit.terms.regularisers import Laplacian
+        >>> from spt_jax.fit import Variables
+        >>> from spt_jax.fit import Laplacian
         >>> body = load_body()
         >>> shape, translation = jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3))
         >>> rest = Variables(jnp.zeros((1, body.num_joints, 3)), shape, translation)
