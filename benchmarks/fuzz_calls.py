@@ -160,7 +160,7 @@ def _options(rng: np.random.Generator, traced_faces: bool) -> dict[str, Any]:
         options["ignore_groups"] = (((0, 0), (1, 1)), ((0, 1),))[rng.integers(2)]
     if not traced_faces and rng.integers(3) == 0:
         options["rest_surface"] = RestSurface(_REST, _FACES, distance=0.3)
-    if rng.integers(4) == 0:  # by fewer rays than it casts by default, which only cost time here
+    if rng.integers(10) == 0:  # by fewer rays than it casts by default, which only cost time here
         options |= {"backend": "xla", "rays": options.get("rays")}
         options["rays"] = 24 if options["rays"] is None else options["rays"]
     return options
