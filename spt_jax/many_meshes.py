@@ -13,10 +13,10 @@ ManyMeshes = Callable[[Array, Array, Any], Any]
 
 
 def as_more_meshes(function: ManyMeshes) -> ManyMeshes:
-    """The function, under `vmap` called once with the lanes as more meshes of the same list.
+    """Wrap a function so that `vmap` folds its axis into the leading mesh axis and calls it once.
 
-    Without this, `vmap` would give every lane arrays of its own, and all of them at once. What all
-    meshes share is not batched.
+    Without this, `vmap` would allocate the arrays of all lanes at once. What all meshes share is
+    not batched.
     """
     mapped = jax.custom_batching.custom_vmap(function)
 

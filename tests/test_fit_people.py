@@ -75,5 +75,7 @@ def test_people_who_embrace_end_apart(body, fitted):
 def test_options_that_fit_pose_lacks_are_refused(body):
     camera = PinholeCamera(1200.0, (500.0, 500.0))
     points = np.zeros((2, 22, 2), np.float32)
-    with pytest.raises(TypeError, match="options must be those of fit_pose: got 'weight'"):
+    with pytest.raises(
+        TypeError, match=r"takes the options of fit_pose: got an unexpected 'weight'"
+    ):
         fit_people(body, points, camera, layout="smpl", weight=1.0)

@@ -1,4 +1,4 @@
-"""How much room the device path gives itself."""
+"""Sizes of the buffers of the path in JAX alone."""
 
 from typing import Any, NamedTuple
 

@@ -155,7 +155,9 @@ def fit_people(
     known = inspect.signature(fit_pose).parameters
     for name in options:
         if name not in known or name in ("body", "keypoints", "camera", "layout", "max_steps"):
-            raise TypeError(f"options must be those of fit_pose: got {name!r}.")
+            raise TypeError(
+                f"fit_people() takes the options of fit_pose: got an unexpected {name!r}."
+            )
     if isinstance(keypoints, Tracer):
         raise TypeError(
             "keypoints must be known: got a traced array; fit_people decides by the values that "

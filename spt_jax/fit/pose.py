@@ -98,7 +98,7 @@ def fit_pose(
             rho(x) = x^2.
         starts: how many orientations to try.
         solver: of the regularised stages, any optimistix minimiser; BFGS by default.
-        keypoint_solver: of the keypoints' objective, likewise.
+        keypoint_solver: minimises the keypoints' objective in the search; any optimistix minimiser.
         max_steps: of each regularised stage.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What the people of one call share, checked and put together."""
+"""Check the arguments of a fit and build the problem that all people of the batch share."""
 
 from typing import Any
 

@@ -175,9 +175,9 @@ def counted_intervals(
     allowed = np.append(rims.may_count, True)  # -1: in no region
     collides = np.zeros(len(rims.region), bool)
     collides[rims.pairs[rims.collides]] = True
-    # What folds has few sheets far from each other, and one end at the rim will do. Groups tell
-    # the sheets apart by themselves: of two bodies, one end would add 6 % of folds to what is
-    # between them, both ends add 0.2 %.
+    # With folds excluded, an interval counts if either of its end faces lies on a colliding
+    # contour. With groups, both must: accepting one would attribute 6 % of each body's own overlap
+    # to the pair, requiring both leaves 0.2 %.
     at_rim = np.any if exclusions.rest is not None else np.all
     counted = []
     for overlaps in beams:

@@ -1,1 +1,1 @@
-"""What the triangles tell by themselves, exactly: who crosses whom, what lies in what, volume."""
+"""Exact computations on the triangles, without rays: intersections, winding numbers, volume."""

@@ -26,9 +26,10 @@ from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
 from spt_jax.overlap.triangles.pair_planes import ROUNDING, not_apart, straddles
 from spt_jax.overlap.triangles.predicates import Predicates
 
-# Pairs of triangles that no plane of theirs parts. More of them are noise, and would take all the
-# memory there is: a body of 24,540 triangles has 1,800, with joints turned by 2 rad at random
-# 16,000, with every vertex moved by 5 mm at random 200,000, by 20 mm, a triangle's size, 2,300,000.
+# Upper bound on face pairs that the plane of neither face separates. A mesh with more is noise, and
+# the list would exhaust memory: a body of 24,540 triangles has 1,800, with joints turned by 2 rad
+# at random 16,000, with every vertex moved by 5 mm at random 200,000, by 20 mm, a triangle's size,
+# 2,300,000.
 _MOST_PAIRS, _MOST_PAIRS_EACH = 2_000_000, 20
 
 
