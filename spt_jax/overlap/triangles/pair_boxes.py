@@ -4,11 +4,11 @@ The boxes of all clusters and of groups of them are refitted to the triangles at
 triangles make a cluster is kept in `pair_layout.py`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 
@@ -18,21 +18,43 @@ from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 _CHUNK = 96 << 10
 # A coordinate of a box takes 20 bits and a guard bit, three to a word: two subtractions of words
 # do the six comparisons of two boxes, and a pair gathers four numbers instead of twelve.
+_LEVEL = CLUSTER.bit_length() - 1
 _FIELD = 21
-_STEPS = (1 << (_FIELD - 1)) - 3  # one more for what is rounded up, and one for empty slots
-_GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
-_BEFORE = np.triu(np.ones((CLUSTER, CLUSTER), bool), 1)
-_Pairs = list[tuple[np.ndarray, np.ndarray]]
+STEPS = (1 << (_FIELD - 1)) - 3  # one more for what is rounded up, and one for empty slots
+GUARDS = sum(1 << (_FIELD * k + _FIELD - 1) for k in range(3))
+# Rows of eight bytes: which members of a group come after each one, and at last all of them.
+_AFTER = np.ones((CLUSTER + 1, CLUSTER), np.uint8)
+_AFTER[:-1] = np.triu(_AFTER[:-1], 1)
+_AFTER = _AFTER.view(np.uint64).ravel()
+# The same in half the bytes for boxes that are known to be near each other: 9 bits of a coordinate,
+# counted round, and a guard bit. The sign of a difference is its highest bit but the guard.
+_SHORT_FIELD = 10
+_SHORT_MASK = (1 << (_SHORT_FIELD - 1)) - 1
+_SHORT_GUARDS = np.uint32(sum(1 << (_SHORT_FIELD * k + _SHORT_FIELD - 1) for k in range(3)))
+_SHORT_SIGNS = np.uint32(sum(1 << (_SHORT_FIELD * k + _SHORT_FIELD - 2) for k in range(3)))
+# Clusters so many times as large as the usual one are compared in long words.
+_LARGE = 5
+Pairs = list[tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class _Boxes:
-    """Boxes as whole numbers (3, C), and as words."""
+class Boxes:
+    """Boxes as whole numbers (3, C), and as words; and those around every `CLUSTER` of them."""
 
     low: Int[np.ndarray, "3 C"]
     high: Int[np.ndarray, "3 C"]
     low_word: Int[np.ndarray, "C"]
     high_word: Int[np.ndarray, "C"]
+    around: "Boxes | None" = None
+
+
+@dataclass(frozen=True)
+class _Short:
+    """Boxes in short words, for the triangles of clusters that meet; and clusters too large."""
+
+    low: UInt32[np.ndarray, "S"]
+    high: UInt32[np.ndarray, "S"]
+    large: Bool[np.ndarray, "C"]
 
 
 @dataclass(frozen=True)
@@ -65,15 +87,15 @@ def _shape(points, layout: Layout) -> Shape:
     extent = (high - low).sum(axis=0)
     base = low.min(axis=1, keepdims=True)
     span = float((high - base).max())
-    scale = _STEPS / span if span > 0 else 0.0
+    scale = STEPS / span if span > 0 else 0.0
     # Rounding down keeps the order of any two coordinates, so boxes that meet still do; one more
     # step, and so do boxes that are apart by rounding.
     low = ((low - base) * scale).astype(np.int64)
     high = ((high - base) * scale).astype(np.int64) + 1
-    low[:, layout.empty] = _STEPS + 2  # above every other, also one that spans the mesh
+    low[:, layout.empty] = STEPS + 2  # above every other, also one that spans the mesh
     high[:, layout.empty] = 0
     length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    words = _word(low), _word(high) | _GUARDS
+    words = word(low), word(high) | GUARDS
     return Shape(corner, normal, length, extent, low, high, *words, span)
 
 
@@ -85,12 +107,12 @@ def near_groups(mesh: Prepared, points):
         if layout is None:
             layout = mesh.arrange(_face_boxes(points, mesh.topology.faces))
         shape = _shape(points, layout)
-        clusters = _joined(shape.low, shape.high)
-        groups = _joined(clusters.low, clusters.high)
+        groups = joined(*around(*around(shape.low, shape.high)))
+        clusters = joined(*around(shape.low, shape.high), groups)
         # Clusters that were compact once may be strewn all over another shape.
         limit = 2 * mesh.usual_pairs + len(groups.low_word)
         pairs, count = [], 0
-        for a, b in _meeting_boxes(groups):
+        for a, b in meeting_boxes(groups):
             pairs.append((a, b))
             count += len(a)
             if count > limit and not fresh:
@@ -102,15 +124,29 @@ def near_groups(mesh: Prepared, points):
         layout, fresh = None, True
 
 
-def near_pairs(layout: Layout, shape: Shape, clusters: _Boxes, groups: _Pairs, touching):
-    """Pairs of slots that share no vertex and whose boxes meet, in parts of bounded size."""
+def near_pairs(layout: Layout, shape: Shape, clusters: Boxes, groups: Pairs, touching):
+    """Pairs of slots that share no vertex and whose boxes meet, in parts of bounded size.
+
+    Args:
+        layout, shape, clusters, groups: as `near_groups` gives them.
+        touching: only pairs with one of these faces are wanted.
+    """
+    slots = touching[layout.face]
+    marked = slots.reshape(-1, CLUSTER).any(axis=1)
+
+    def found():
+        yield from within_clusters(layout, shape)
+        yield from across_groups(layout, shape, clusters, groups, marked)
+
+    for t, u in parts_of_size(found()):
+        kept = slots[t] | slots[u]
+        yield t[kept], u[kept]
+
+
+def parts_of_size(found: Iterable[tuple[np.ndarray, np.ndarray]]):
+    """The same pairs in fewer parts, of bounded size."""
     waiting, size = [], 0
-    slots = None if touching is None else touching[layout.face]
-    marked = None if slots is None else slots.reshape(-1, CLUSTER).any(axis=1)
-    for t, u in _all_near_pairs(layout, shape, clusters, groups, marked):
-        if slots is not None:
-            kept = slots[t] | slots[u]
-            t, u = t[kept], u[kept]
+    for t, u in found:
         waiting.append((t, u))
         size += len(t)
         if size > _CHUNK:
@@ -120,9 +156,14 @@ def near_pairs(layout: Layout, shape: Shape, clusters: _Boxes, groups: _Pairs, t
         yield concatenate(waiting)
 
 
-def _all_near_pairs(layout: Layout, shape: Shape, clusters: _Boxes, groups: _Pairs, marked):
+def within_clusters(layout: Layout, shape: Shape):
+    """Such pairs of one cluster."""
     for part in pieces(layout.apart.shape[1], 1):
-        yield _kept_meeting(shape, *layout.apart[:, part])
+        yield kept_meeting(shape, *layout.apart[:, part])
+
+
+def across_groups(layout: Layout, shape: Shape, clusters: Boxes, groups: Pairs, marked=None):
+    """Such pairs of different clusters, of pairs of groups."""
     for a, b in groups:
         for c, d, row in _meeting_members(layout, clusters, a, b):
             if marked is not None:
@@ -131,7 +172,7 @@ def _all_near_pairs(layout: Layout, shape: Shape, clusters: _Boxes, groups: _Pai
             yield from _meeting_triangles(layout, shape, clusters, c, d, row)
 
 
-def _meeting_boxes(boxes: _Boxes):
+def meeting_boxes(boxes: Boxes):
     """Pairs of boxes that meet, the lower first, each with itself too, in parts of bounded size."""
     axis = int(np.argmax(np.ptp(boxes.low, axis=1)))
     order = np.argsort(boxes.low[axis])
@@ -148,7 +189,7 @@ def _meeting_boxes(boxes: _Boxes):
         yield np.minimum(a, b), np.maximum(a, b)
 
 
-def _meeting_members(layout: Layout, clusters: _Boxes, a, b):
+def _meeting_members(layout: Layout, clusters: Boxes, a, b):
     """Pairs of clusters of the groups a and b that meet, a before b where these are the same.
 
     Yields:
@@ -156,55 +197,108 @@ def _meeting_members(layout: Layout, clusters: _Boxes, a, b):
     """
     low, high = (word.reshape(-1, CLUSTER) for word in (clusters.low_word, clusters.high_word))
     rows = layout.sharing.rows_of(a, b)
-    for part in pieces(len(a), CLUSTER * CLUSTER):
-        p, q = a[part], b[part]
-        meet = _meet(
-            low.take(p, axis=0)[:, :, None],
-            high.take(p, axis=0)[:, :, None],
-            low.take(q, axis=0)[:, None, :],
-            high.take(q, axis=0)[:, None, :],
-        )
-        meet[p == q] &= _BEFORE
-        found = np.flatnonzero(meet)
-        pair, place = found // CLUSTER**2, found % CLUSTER**2
-        row = layout.sharing.row.take(rows[part].take(pair) * CLUSTER**2 + place)
-        p, q = CLUSTER * p.take(pair), CLUSTER * q.take(pair)
-        yield p + place // CLUSTER, q + place % CLUSTER, row
-
-
-def _meeting_triangles(layout: Layout, shape: Shape, boxes: _Boxes, a, b, row):
-    """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
-    low, high = (word.reshape(-1, CLUSTER) for word in (shape.low_word, shape.high_word))
-    masks = layout.sharing.apart.reshape(-1, CLUSTER)
-    for part in pieces(len(a), 3 * CLUSTER):
-        pair, t = _reaching(shape, boxes, a[part], b[part])
-        # Against all of the other cluster at once: only those that reach back are fewer, but to
-        # look each of them up takes a third longer.
-        other, mask = b[part].take(pair), row[part].take(pair) * CLUSTER + t % CLUSTER
-        for piece in pieces(len(t), CLUSTER):
-            u, first = other[piece], t[piece]
-            low_t, high_t = shape.low_word.take(first), shape.high_word.take(first)
-            meet = _meet(low_t[:, None], high_t[:, None], low.take(u, axis=0), high.take(u, axis=0))
-            meet &= masks.take(mask[piece], axis=0)
+    for part in pieces(len(a), CLUSTER):
+        of, c = _reaching(clusters, clusters.around, a[part], b[part])
+        row, same = rows[part], a[part] == b[part]
+        for piece in pieces(len(c), CLUSTER):
+            pair, first = of[piece], c[piece]
+            q = b[part].take(pair)
+            meet = _meet(
+                clusters.low_word.take(first)[:, None],
+                clusters.high_word.take(first)[:, None],
+                low.take(q, axis=0),
+                high.take(q, axis=0),
+            )
+            within = first & (CLUSTER - 1)
+            whole = meet.view(np.uint64).ravel()
+            whole &= _AFTER.take(np.where(same.take(pair), within, CLUSTER))
             found = np.flatnonzero(meet)
-            at = found // CLUSTER
-            second = CLUSTER * u.take(at) + found % CLUSTER
-            yield _sharing_none(layout, first.take(at), second)
+            at, place = found >> _LEVEL, found & (CLUSTER - 1)
+            first = first.take(at)
+            of_group = row.take(pair.take(at)) * CLUSTER**2 + within.take(at) * CLUSTER + place
+            yield first, CLUSTER * q.take(at) + place, layout.sharing.row.take(of_group)
 
 
-def _reaching(shape: Shape, boxes: _Boxes, a, b):
-    """The triangles of cluster a whose boxes meet the box of b: number of the pair, and slot."""
+def _meeting_triangles(layout: Layout, shape: Shape, boxes: Boxes, a, b, row):
+    """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
+    short = _short_words(shape, boxes)
+    large = short.large.take(a) | short.large.take(b)
+    for words, chosen in ((short, np.flatnonzero(~large)), (None, np.flatnonzero(large))):
+        pairs = a.take(chosen), b.take(chosen), row.take(chosen)
+        for part in pieces(len(chosen), 3 * CLUSTER):
+            yield from _meeting_across(layout, shape, boxes, words, *(x[part] for x in pairs))
+
+
+def _meeting_across(layout: Layout, shape: Shape, boxes: Boxes, short: "_Short | None", a, b, row):
+    pair, t = _reaching(shape, boxes, a, b)
+    # Against all of the other cluster at once: only those that reach back are fewer, but to look
+    # each of them up takes a third longer.
+    other, mask = b.take(pair), row.take(pair) * CLUSTER + (t & (CLUSTER - 1))
+    whole = layout.sharing.whole
+    # A row of eight bytes at a time.
+    masks = layout.sharing.apart.view(np.uint64).ravel()
+    words = (shape.low_word, shape.high_word) if short is None else (short.low, short.high)
+    low, high = (word.reshape(-1, CLUSTER) for word in words)
+    for piece in pieces(len(t), CLUSTER):
+        u, first = other[piece], t[piece]
+        own_low, own_high = (word.take(first)[:, None] for word in words)
+        if short is None:
+            meet = _meet(own_low, own_high, low.take(u, axis=0), high.take(u, axis=0))
+        else:
+            gap = own_high - low.take(u, axis=0)
+            gap |= high.take(u, axis=0) - own_low
+            gap &= _SHORT_SIGNS
+            meet = gap == 0
+        # By whole rows: nine of ten have none.
+        rows = meet.view(np.uint64).ravel()
+        rows &= masks.take(mask[piece])
+        some = np.flatnonzero(rows != 0)
+        found = np.flatnonzero(meet.take(some, axis=0))
+        at = some.take(found >> _LEVEL)
+        first, second = first.take(at), CLUSTER * u.take(at) + (found & (CLUSTER - 1))
+        if short is not None:
+            first, second = kept_meeting(shape, first, second)
+        yield (first, second) if whole else _sharing_none(layout, first, second)
+
+
+def _short_words(shape: Shape, clusters: Boxes) -> _Short:
+    """The triangles' boxes in short words.
+
+    Two coordinates of triangles in clusters that meet differ by two clusters' extents at most. So
+    the sign of their difference is known of any steps of which that is less than 256.
+    """
+    extent = (clusters.high - clusters.low).max(axis=0)
+    usual = np.median(extent[extent >= 0]) if (extent >= 0).any() else 0  # below 0 where empty
+    large = extent > _LARGE * usual
+    most = int(extent[~large].max(initial=0))
+    shift = max((2 * most + 2).bit_length() - (_SHORT_FIELD - 2), 0)
+    low, high = (
+        _short_word((field.astype(np.uint32) >> np.uint32(shift)) & np.uint32(_SHORT_MASK))
+        for field in (shape.low, shape.high)
+    )
+    return _Short(low, high | _SHORT_GUARDS, large)
+
+
+def _short_word(field):
+    return (field[0] << 2 * _SHORT_FIELD) | (field[1] << _SHORT_FIELD) | field[2]
+
+
+def _reaching(members: Shape | Boxes, boxes: Boxes | None, a, b):
+    """The members of box a that meet box b: number of the pair, and member."""
+    if boxes is None:
+        raise ValueError("boxes must have boxes around them: got none.")
     # Whole rows by take, never by index: five times as fast.
-    low = shape.low_word.reshape(-1, CLUSTER).take(a, axis=0)
-    high = shape.high_word.reshape(-1, CLUSTER).take(a, axis=0)
+    low = members.low_word.reshape(-1, CLUSTER).take(a, axis=0)
+    high = members.high_word.reshape(-1, CLUSTER).take(a, axis=0)
     found = np.flatnonzero(
         _meet(low, high, boxes.low_word.take(b)[:, None], boxes.high_word.take(b)[:, None])
     )
-    pair = found // CLUSTER
+    pair = found >> _LEVEL
     return pair, found + CLUSTER * (a.take(pair) - pair)
 
 
-def _kept_meeting(shape: Shape, t, u):
+def kept_meeting(shape: Shape, t, u):
+    """The pairs of slots whose boxes meet."""
     low, high = shape.low_word, shape.high_word
     kept = np.flatnonzero(_meet(low.take(t), high.take(t), low.take(u), high.take(u)))
     return t.take(kept), u.take(kept)
@@ -219,16 +313,22 @@ def _sharing_none(layout: Layout, t, u):
     return t.take(kept), u.take(kept)
 
 
-def _joined(low, high) -> _Boxes:
+def around(low, high):
     """The boxes around every `CLUSTER` boxes."""
     count = low.shape[1] // CLUSTER
     while low.shape[1] > count:
         low = np.minimum(low[:, ::2], low[:, 1::2])
         high = np.maximum(high[:, ::2], high[:, 1::2])
-    return _Boxes(low, high, _word(low), _word(high) | _GUARDS)
+    return low, high
 
 
-def _word(field):
+def joined(low, high, around: Boxes | None = None) -> Boxes:
+    """Boxes with their words."""
+    return Boxes(low, high, word(low), word(high) | GUARDS, around)
+
+
+def word(field):
+    """Three coordinates in one number."""
     return (((field[0] << _FIELD) | field[1]) << _FIELD) | field[2]
 
 
@@ -236,8 +336,8 @@ def _meet(low, high, other_low, other_high):
     """Whether boxes meet: a guard bit survives where the high end is not below the low one."""
     first = high - other_low
     first &= other_high - low
-    first &= _GUARDS
-    return first == _GUARDS
+    first &= GUARDS
+    return first == GUARDS
 
 
 def concatenate(pairs):

@@ -1,11 +1,13 @@
 """What the search for crossing triangles keeps about a list of faces from one call to the next."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.triangles.blocks import Blocks, blocks_of
 from spt_jax.overlap.triangles.faces_cache import FacesCache
 from spt_jax.overlap.triangles.manifold import matched_half_edges
 from spt_jax.overlap.triangles.pair_sharing import Sharing, sharing
@@ -14,8 +16,6 @@ from spt_jax.overlap.triangles.pair_sharing import Sharing, sharing
 # that meet, 16 make 300,000 pairs of triangles in them to look at; 8 make 16,000 and 210,000.
 CLUSTER = 8
 _KEPT_SHAPES = 4
-# Connected parts that are walked from a vertex of theirs; more are found together.
-_MOST_STARTS = 16
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,7 @@ class Topology:
         closed: vertices whose triangles surround them: each edge there has two triangles,
             which run along it in opposite senses.
         used: vertices of any triangle.
-        neighbours: (V, V), has an entry for each edge in both directions.
-        entries: the places of each row's two directions in its data and indices.
-        starts: a vertex of each connected part, of the largest few.
+        blocks: the vertices in connected blocks.
         fan_start, fan: the corners (3 face + corner) at each vertex v are
             fan[fan_start[v] : fan_start[v + 1]].
     """
@@ -51,9 +49,7 @@ class Topology:
     opposite: Int[np.ndarray, "F 3"]
     closed: Bool[np.ndarray, "V"]
     used: Bool[np.ndarray, "V"]
-    neighbours: "scipy.sparse.csr_array"
-    entries: Int[np.ndarray, "R 2"]
-    starts: Int[np.ndarray, "P"]
+    blocks: Blocks
     fan_start: Int[np.ndarray, "V1"]
     fan: Int[np.ndarray, "F3"]
 
@@ -88,12 +84,13 @@ class Layout:
 
 @dataclass
 class Prepared:
-    """A mesh's topology, and a layout that suits the shapes in which it has been seen."""
+    """A mesh's topology, and what suits the shapes in which it has been seen."""
 
     topology: Topology
     layout: Layout | None = None
     shapes: list[Float[np.ndarray, "F 6"]] = field(default_factory=list)
     usual_pairs: int = 0  # of groups whose boxes meet
+    kept: Any = None  # `warm_pairs.Kept`
 
     def arrange(self, box: Float[np.ndarray, "F 6"]) -> Layout:
         """A new layout, for this shape (each face's lowest and highest corner) and earlier ones."""
@@ -126,14 +123,6 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
     ragged = ~matched | (np.bincount(edge_id)[edge_id] > 1)
     closed[ends[ragged]] = False
     fan = np.argsort(faces.ravel(), kind="stable")
-    tail, head = np.concatenate([ends, ends[:, ::-1]]).T
-    order = np.lexsort((head, tail))
-    entries = np.empty(len(order), np.int64)
-    entries[order] = np.arange(len(order))
-    degree = np.bincount(tail, minlength=count)
-    neighbours = scipy.sparse.csr_array(
-        (np.ones(len(order)), head[order], np.append(0, np.cumsum(degree))), shape=(count, count)
-    )
     return Topology(
         faces=faces,
         ends=ends,
@@ -144,9 +133,7 @@ def _topology(faces: Int[np.ndarray, "F 3"], count: int) -> Topology:
         opposite=opposite.reshape(faces.shape),
         closed=closed,
         used=used,
-        neighbours=neighbours,
-        entries=entries.reshape(2, -1).T,
-        starts=_starts(neighbours),
+        blocks=blocks_of(ends, count),
         fan_start=np.append(0, np.cumsum(np.bincount(faces.ravel(), minlength=count))),
         fan=fan,
     )
@@ -169,13 +156,6 @@ def _rows(faces, low, high):
     first = np.concatenate([pairs.min(axis=0), left[lead]])
     second = np.concatenate([pairs.max(axis=0), np.where(mated, left[mate], -1)])
     return first, second, np.arange(len(first)) < pairs.shape[1]
-
-
-def _starts(neighbours) -> Int[np.ndarray, "P"]:
-    part = scipy.sparse.csgraph.connected_components(neighbours, directed=False)[1]
-    vertex = np.zeros(part.max(initial=-1) + 1, np.int64)
-    vertex[part] = np.arange(len(part))
-    return vertex[np.argsort(-np.bincount(part), kind="stable")[:_MOST_STARTS]]
 
 
 def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layout:

@@ -28,12 +28,14 @@ class Sharing:
             in them, a row of `apart`.
         apart: for a pair of clusters, by the places of two triangles in them, whether the two are
             not known to share a vertex. In the last row, for all other pairs, none is.
+        whole: whether all that share one are known.
     """
 
     groups: int
     key: Int[np.ndarray, "G"]
     row: Int[np.ndarray, "G1 CC"]
     apart: Bool[np.ndarray, "R1 C C"]
+    whole: bool
 
     def rows_of(self, first: Int[np.ndarray, "N"], second: Int[np.ndarray, "N"]):
         """The rows of `row` for pairs of groups, the first of which is the lower one."""
@@ -84,4 +86,4 @@ def sharing(corners: Int[np.ndarray, "3 S"], filled: Bool[np.ndarray, "S"], size
     key, at = np.unique(of_groups, return_inverse=True)
     row = np.full((len(key) + 1, size * size), len(found), np.int32)
     row[at, first % size * size + second % size] = np.arange(len(found))
-    return Sharing(groups, key, row, apart)
+    return Sharing(groups, key, row, apart, bool(few.all()))

@@ -25,6 +25,7 @@ from spt_jax.overlap.triangles.pair_boxes import (
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
 from spt_jax.overlap.triangles.pair_planes import ROUNDING, not_apart, straddles
 from spt_jax.overlap.triangles.predicates import Predicates
+from spt_jax.overlap.triangles.warm_pairs import warm_pairs
 
 # Upper bound on face pairs that the plane of neither face separates. A mesh with more is noise, and
 # the list would exhaust memory: a body of 24,540 triangles has 1,800, with joints turned by 2 rad
@@ -146,7 +147,12 @@ def find_intersections(
     found = list(_around_vertices(points, topology, layout, shape))
     seen, most = 0, _MOST_PAIRS + _MOST_PAIRS_EACH * len(faces)
     near = [np.zeros((2, 0), np.int64)]
-    for t, u in near_pairs(layout, shape, clusters, groups, touching):
+    if touching is None:
+        scale = predicates.scale
+        pairs = warm_pairs(mesh, points, scale, layout, shape, clusters, groups)
+    else:
+        pairs = near_pairs(layout, shape, clusters, groups, touching)
+    for t, u in pairs:
         t, u, in_plane = not_apart(layout, shape, t, u, reach)
         near.append(in_plane)
         seen += len(t)

@@ -14,7 +14,6 @@ and such a part is not seen by the ray. Several choices, called layers, are work
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from jaxtyping import Bool, Int
 
 from spt_jax.overlap.triangles.contacts import Contacts
@@ -100,7 +99,7 @@ def winding_numbers(
         axis=1,
     )
     alone = np.flatnonzero(cusp)
-    patch = _patches(topology, cut, alone)
+    patch = topology.blocks.patches(cut, alone)
 
     # The nodes: patches, and the ends of edges at cusps.
     node, at_cusp = patch.copy(), np.full(2 * len(topology.ends), -1)
@@ -159,39 +158,6 @@ def _around_cusps(topology, contours: Contours, counts, times, corner):
         rise = sign * outwards * times[contours.pair[at, 1 - k]]
         np.add.at(total, 3 * face + turn, rise[:, None] * on)
     return total[corner]
-
-
-def _patches(topology: Topology, cut: Int[np.ndarray, "K"], alone: Int[np.ndarray, "A"]):
-    """A number for each vertex, the same for those that edges join which pass through nothing."""
-    graph = topology.neighbours
-    # An edge that joins nothing leads from its end to itself, and so do all edges from a vertex
-    # that stands alone; those that lead to it may stay, since none leads on.
-    indices = graph.indices.copy()
-    for there, end in zip(topology.entries[cut].T, topology.ends[cut].T, strict=True):
-        indices[there] = end
-    there, at = spread(graph.indptr[alone], np.diff(graph.indptr)[alone])
-    indices[there] = alone[at]
-    joined = scipy.sparse.csr_array((graph.data, indices, graph.indptr), shape=graph.shape)
-    # Breadth first finds most of a solid in a quarter of the time for all parts.
-    patch = np.full(len(topology.used), -1)
-    for number, start in enumerate(topology.starts.tolist()):
-        reached, _ = scipy.sparse.csgraph.breadth_first_order(joined, start)
-        patch[reached] = number
-    rest = np.flatnonzero(patch < 0)
-    if len(rest):
-        number = np.full(len(patch), -1)
-        number[rest] = np.arange(len(rest))
-        there, at = spread(graph.indptr[rest], np.diff(graph.indptr)[rest])
-        to = number[indices[there]]
-        kept = np.flatnonzero(to >= 0)
-        shape = len(rest), len(rest)
-        links = scipy.sparse.coo_array((np.ones(len(kept)), (at[kept], to[kept])), shape=shape)
-        # Of a symmetric graph these are the connected parts, for half the time.
-        _, part = scipy.sparse.csgraph.connected_components(
-            links, directed=True, connection="strong"
-        )
-        patch[rest] = len(topology.starts) + part
-    return patch
 
 
 def _spread_from(root, value, first, second, step, size: int):
