@@ -24,8 +24,18 @@ from spt_jax.device.settings import Xla
 from spt_jax.exclusions import as_exclusions
 from spt_jax.geometry import inflate
 from spt_jax.host import call_on_host, is_local
+from spt_jax.overlap.convex import is_small_convex_solid
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.overlap.measure import Gradient, Rule, Sampling, Unmeasurable, Value, measure
+from spt_jax.overlap.inflation import Inflated
+from spt_jax.overlap.measure import (
+    Gradient,
+    Rule,
+    Sampling,
+    Unmeasurable,
+    Value,
+    check_usable,
+    measure,
+)
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest_surface import RestSurface
 from spt_jax.reverse_only import refuse_forward, with_slope
@@ -150,9 +160,10 @@ def self_intersection_penalty(
         Sampling(as_rays(rays), as_directions(directions)),
         as_exclusions(face_groups, ignore_groups, rest_surface, faces),
         float(np.finfo(vertices.dtype).eps),
+        apart / 2,
     )
     device = as_backend(backend)
-    if apart:
+    if apart and device is not None:
         vertices = inflate(vertices, faces, apart / 2)
     vertices = refuse_forward(vertices)
     if device is not None:
@@ -221,6 +232,7 @@ class _Options(NamedTuple):
     sampling: Sampling
     exclusions: Exclusions
     rounding: float  # machine epsilon of the vertices
+    outwards: float = 0.0  # how far the surface is moved before it is measured
 
 
 class _Known(NamedTuple):
@@ -296,7 +308,16 @@ def _value_and_gradient_on_host(vertices, faces, options: _Options):
 
 def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
     nothing = np.zeros_like(vertices)
+    moved = None
     try:
+        check_usable(vertices, faces, options.rounding)
+        if options.outwards and faces.size:
+            moved = Inflated(vertices, faces, options.outwards, options.rounding)
+            vertices = moved.vertices
+            check_usable(vertices, faces, options.rounding)
+        exact = options.sampling.rays is None
+        if exact and is_small_convex_solid(vertices, faces, options.rounding):
+            return np.zeros(()), nothing
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
         if faces.size == 0:
             return np.zeros(()), nothing
@@ -305,6 +326,8 @@ def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
         else:
             value = np.mean(found.labels(options.rule) != 0)
         gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
+        if moved is not None:
+            gradient = moved.pulled_back(gradient)
     except Unmeasurable:
         return np.array(np.nan), nothing
     # Measured in float64: it may be more than the vertices' dtype can hold, or less.

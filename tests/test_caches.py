@@ -46,10 +46,10 @@ def test_a_bounded_jit_forgets_and_still_answers():
 
 
 @pytest.mark.parametrize("how", ["value", "gradient"])
-def test_a_margin_of_meshes_of_ever_other_sizes_keeps_a_bounded_number_of_programs(how):
+def test_inflating_meshes_of_ever_other_sizes_keeps_a_bounded_number_of_programs(how):
     """Under `jax.grad`, too, where arrays are tracers and programs are compiled all the same."""
     clear_caches()
-    step = lambda v: self_intersection_penalty(v, PAIR[1], margin=0.01)  # noqa: E731
+    step = lambda v: geometry.inflate(v, PAIR[1], 0.01).sum()  # noqa: E731
     step = jax.grad(step) if how == "gradient" else step
     live = []
     before, geometry._inflated._most = geometry._inflated._most, 3
@@ -62,6 +62,16 @@ def test_a_margin_of_meshes_of_ever_other_sizes_keeps_a_bounded_number_of_progra
         geometry._inflated._most = before
     assert len(geometry._inflated) == 1
     assert max(live[3:]) <= max(live[:3]), live
+
+
+def test_a_margin_leaves_no_program():
+    """It is kept on the host."""
+    clear_caches()
+    for count in range(3):
+        vertices = np.float32(np.concatenate([PAIR[0], np.zeros((count, 3))]))
+        value = self_intersection_penalty(jax.device_put(vertices), PAIR[1], margin=0.01 + count)
+        assert value > 0.4
+    assert len(geometry._inflated) == 0
 
 
 def test_new_values_of_every_option_keep_a_bounded_number_of_things(rng):
@@ -96,7 +106,7 @@ def test_compiled_programs_are_given_back_too():
     client = jax.devices()[0].client
     for count in range(8, 12):
         vertices = np.concatenate([PAIR[0], np.zeros((count, 3))])
-        step = lambda v: self_intersection_penalty(v, PAIR[1], margin=0.01)  # noqa: E731
+        step = lambda v: geometry.inflate(v, PAIR[1], 0.01).sum()  # noqa: E731
         jax.value_and_grad(step)(jnp.asarray(vertices, "float32"))
     assert len(client.live_executables()) >= 8
     clear_caches()

@@ -231,13 +231,24 @@ def measure(
             overflow or vanish, a mesh so far from the origin that rounding has eaten its shape, or
             so crumpled that its intersections are too many to be listed.
     """
-    reason = _unusable(vertices, faces, rounding)
-    if reason is not None:
-        raise Unmeasurable(reason)
+    check_usable(vertices, faces, rounding)
     found = Measurement(vertices, faces, sampling, exclusions, rounding)
     if sampling.rays is None or exclusions.any:
         _ = found.surface  # rays alone need none
     return found
+
+
+def check_usable(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], rounding: float
+) -> None:
+    """Refuse what cannot be measured.
+
+    Raises:
+        Unmeasurable: as `measure`, but for a mesh so crumpled that it cannot be listed.
+    """
+    reason = _unusable(vertices, faces, rounding)
+    if reason is not None:
+        raise Unmeasurable(reason)
 
 
 def _unusable(vertices, faces, rounding: float) -> str | None:

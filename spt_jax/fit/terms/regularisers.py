@@ -166,9 +166,9 @@ class SelfIntersection(Regulariser):
         """Overlap of all people with themselves and each other: cm^3, or per cent of vertices."""
         vertices = body(now.pose, now.shape, now.translation).vertices
         scene = join_bodies(vertices, body.faces)
-        surface = scene.vertices
-        if isinstance(self.margin, Array) or self.margin > 0:
-            surface = inflate(surface, scene.faces, self.margin / 2)
+        surface, margin = scene.vertices, self.margin
+        if isinstance(margin, Array):  # which may be traced
+            surface, margin = inflate(surface, scene.faces, margin / 2), 0.0
         found = self_intersection_penalty(
             surface,
             scene.faces,
@@ -177,6 +177,7 @@ class SelfIntersection(Regulariser):
             rule=self.rule,
             rays=self.rays,
             directions=np.array(self.directions),
+            margin=margin,
             rest_surface=self.rest_surface,
         )
         return found / _CENTIMETRE**3 if self.value == "volume" else found * 100
