@@ -71,8 +71,8 @@ PARAMETERS = {
     "load_mocap": "",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"
-    " rays=None, directions=3, weights=(0.01, 0.1, 1.0, 10.0, 100.0), steps_per_weight=25,"
-    " tolerance=1e-09, solver=None, on_step=None",
+    " rays=None, directions=3, weights=(0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),"
+    " steps_per_weight=25, tolerance=1e-09, solver=None, on_step=None",
 }
 # Their docstrings say what there is to say without a list of results.
 SHORT = {

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-import optimistix as optx
 from jaxtyping import Float
 
 from spt_jax.arguments import as_directions
@@ -16,9 +15,6 @@ from spt_jax.untangle.steps import Step
 from spt_jax.view.scene import Scene
 
 Show = Callable[[Float[np.ndarray, "V 3"], str], None]
-
-# One object, so that the solver is compiled once.
-_SOLVER = optx.BFGS(rtol=1e-3, atol=1e-3)
 
 
 class Stopped(Exception):
@@ -89,7 +85,6 @@ def _untangle_pose(scene: Scene, show: Show, stopped: Callable[[], bool]) -> Non
             scene.pose,
             shape=scene.shape,
             translation=scene.translation,
-            solver=_SOLVER,
             on_step=steps,
         )
         scene.set_pose(np.asarray(result.pose))
