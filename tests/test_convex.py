@@ -44,7 +44,7 @@ def test_a_convex_solid_is_told_however_it_is_turned(name):
         turned = (vertices @ random_rotation(rng).T + rng.normal(size=3)) * 10.0 ** (k % 5 - 2)
         assert is_small_convex_solid(turned, faces, 8 * EPS)
         found = measure(turned, faces, AUTO)  # the search has the last word
-        assert found.volume == 0 and found.crossing_pairs == 0
+        assert found.volume == 0 and found.intersecting_pairs == 0
         assert not found.gradient("boundary", "vertex").any()
 
 
