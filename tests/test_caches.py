@@ -49,8 +49,13 @@ def test_a_bounded_jit_forgets_and_still_answers():
 def test_inflating_meshes_of_ever_other_sizes_keeps_a_bounded_number_of_programs(how):
     """Under `jax.grad`, too, where arrays are tracers and programs are compiled all the same."""
     clear_caches()
-    step = lambda v: geometry.inflate(v, PAIR[1], 0.01).sum()  # noqa: E731
-    step = jax.grad(step) if how == "gradient" else step
+
+    def step(vertices):
+        inflated = lambda v: geometry.inflate(v, PAIR[1], 0.01)  # noqa: E731
+        if how == "value":
+            return inflated(vertices)
+        return jax.vjp(inflated, vertices)[1](vertices)
+
     live = []
     before, geometry._inflated._most = geometry._inflated._most, 3
     try:
@@ -70,7 +75,7 @@ def test_a_margin_leaves_no_program():
     for count in range(3):
         vertices = np.float32(np.concatenate([PAIR[0], np.zeros((count, 3))]))
         value = self_intersection_penalty(jax.device_put(vertices), PAIR[1], margin=0.01 + count)
-        assert value > 0.4
+        assert value > 0.3
     assert len(geometry._inflated) == 0
 
 

@@ -247,7 +247,9 @@ class _Search(eqx.Module):
         """What is compared and reported is measured with."""
         return 2 * self.rays if isinstance(self.rays, int) else None
 
-    def measure(self, vertices: Float[Array, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Measurement:
+    def measure(
+        self, vertices: Float[Array | np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+    ) -> Measurement:
         """The overlap of a posed body, of which no more is worked out than is asked for.
 
         Raises:
