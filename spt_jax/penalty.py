@@ -80,7 +80,7 @@ def self_intersection_penalty(
         rule: how "ratio", "vertex" and "unit" label the vertices, as in `classify_vertices`.
         rays: None computes the volume in closed form, exact to rounding, so that it is smooth and
             its gradient exact, however the mesh is turned. (Should the sums of the closed form not
-            close, which no mesh has been seen to do, 512 rays a side take over;
+            close, which no closed mesh has been seen to do, 512 rays a side take over;
             `intersection_report` says so.) A number of rays along the longer side of the screen, or
             (rows, columns), samples it as the paper does.
         directions: of the rays, where any are cast: 1 (along -z, the paper's camera), 3 orthogonal
