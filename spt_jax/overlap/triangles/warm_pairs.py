@@ -1,11 +1,12 @@
 """Pairs of triangles near each other, of a mesh that may have moved little since it was last seen.
 
-A search asks for meshes that moved by a millimetre. So the first one's boxes are grown, by a small
-part of a cluster, and the pairs of triangles whose grown boxes meet are kept: twice as many pairs
-for a tenth more time. While two groups of clusters have moved against each other by less than
-their boxes were grown, no pair of theirs meets that is not kept, and what is kept only has to be
-compared again; groups that moved farther, one in eight, are searched anew. How far they moved
-is told along each axis by the least and the largest displacement of each group's vertices.
+A search asks for meshes that moved by a millimetre. So once a mesh comes that has moved little
+since the last one, its boxes are grown, by a small part of a cluster, and the pairs of triangles
+whose grown boxes meet are kept: twice as many pairs. While two groups of clusters have moved
+against each other by less than their boxes were grown, no pair of theirs meets that is not kept,
+and what is kept only has to be compared again; groups that moved farther, one in eight, are
+searched anew. How far they moved is told along each axis by the least and the largest displacement
+of each group's vertices.
 
 Kept pairs never decide anything: whether they intersect is worked out from the coordinates of each
 call, and a pair too many changes nothing. So the results are those of a first call to the bit,
@@ -45,6 +46,9 @@ _FEW = 0.4
 # A table of all pairs of groups is made at each call; larger meshes are searched every time. And so
 # are those of which so many pairs a triangle would be kept.
 _MOST_GROUPS, _MOST_PAIRS_EACH = 2048, 8
+# Where one coordinate of two, of every so many vertices, moved by more than this many growths, the
+# mesh is another one, and groups are not looked at.
+_SOME, _MUCH = 64, 20.0
 # Beyond the growth, boxes are rounded by a step or two in either shape.
 _ROUNDED = 4
 
@@ -58,7 +62,8 @@ class Kept:
         scale: what coordinates had been multiplied by.
         points: the vertices.
         growth: by how much two boxes together had been grown.
-        first, second: the slots of the pairs of different clusters whose grown boxes met.
+        first, second: the slots of the pairs of different clusters whose grown boxes met; None
+            where only the points are kept.
         key: of each pair, its groups as one number.
     """
 
@@ -66,9 +71,9 @@ class Kept:
     scale: float
     points: Float[np.ndarray, "3 V"]
     growth: float
-    first: Int32[np.ndarray, "N"]
-    second: Int32[np.ndarray, "N"]
-    key: Int32[np.ndarray, "N"]
+    first: Int32[np.ndarray, "N"] | None = None
+    second: Int32[np.ndarray, "N"] | None = None
+    key: Int32[np.ndarray, "N"] | None = None
 
 
 def warm_pairs(
@@ -94,36 +99,48 @@ def warm_pairs(
         yield from parts_of_size(across_groups(layout, shape, clusters, groups))
         return
     kept, a, b = mesh.kept, *concatenate(groups)
+    total = (2 * _growth(clusters) - _ROUNDED) * _step(shape)
+    far = np.ones(len(a), bool)
     if kept is not None and kept.layout is layout and kept.scale == scale:
-        far = _moved_far(layout, points - kept.points, a, b, kept.growth - _ROUNDED * _step(shape))
-        if far.mean() <= _FEW:
-            moved = [(a[far], b[far])] if far.any() else []
-            yield from parts_of_size(across_groups(layout, shape, clusters, moved))
-            dropped = np.zeros(count * count, bool)
-            dropped[a[far] * count + b[far]] = True
-            for part in pieces(len(kept.key), 1):
-                there = np.flatnonzero(~dropped.take(kept.key[part]))
-                pair = (x[part].take(there) for x in (kept.first, kept.second))
-                yield kept_meeting(shape, *pair)
-            return
-    growth = _growth(clusters)
-    grown = _grown(shape, growth)
+        allowed = kept.growth - _ROUNDED * _step(shape)
+        moved = points - kept.points
+        if np.median(np.abs(moved[:, ::_SOME])) <= _MUCH * allowed:
+            far = _moved_far(layout, moved, a, b, allowed)
+    if far.mean() > _FEW:
+        yield from parts_of_size(across_groups(layout, shape, clusters, groups))
+        mesh.kept = Kept(layout, scale, points, total)
+    elif kept.first is None:
+        yield from _kept_from(mesh, Kept(layout, scale, points, total), shape, clusters)
+    else:
+        groups = [(a[far], b[far])] if far.any() else []
+        yield from parts_of_size(across_groups(layout, shape, clusters, groups))
+        dropped = np.zeros(count * count, bool)
+        dropped[a[far] * count + b[far]] = True
+        for part in pieces(len(kept.key), 1):
+            there = np.flatnonzero(~dropped.take(kept.key[part]))
+            pair = (x[part].take(there) for x in (kept.first, kept.second))
+            yield kept_meeting(shape, *pair)
+
+
+def _kept_from(mesh: Prepared, kept: Kept, shape: Shape, clusters: Boxes):
+    """The pairs across clusters, found by grown boxes, which are kept."""
+    layout, count = kept.layout, clusters.low.shape[1] // CLUSTER
+    grown = _grown(shape, _growth(clusters))
     around_groups = joined(*around(*around(grown.low, grown.high)))
     larger = joined(*around(grown.low, grown.high), around_groups)
-    found, size = [], 0
+    found, size, most = [], 0, _MOST_PAIRS_EACH * len(layout.slot)
     for t, u in across_groups(layout, grown, larger, list(meeting_boxes(around_groups))):
         size += len(t)
-        if size <= _MOST_PAIRS_EACH * len(layout.slot):
+        if size <= most:
             found.append((t, u))
         yield kept_meeting(shape, t, u)
-    if size > _MOST_PAIRS_EACH * len(layout.slot):
+    if size > most:
         mesh.kept = None
         return
     first, second = concatenate(found) if found else np.zeros((2, 0), np.int64)
     first, second = (x.astype(np.int32) for x in (first, second))
     key = (first // _GROUP) * np.int32(count) + second // _GROUP
-    total = (2 * growth - _ROUNDED) * _step(shape)
-    mesh.kept = Kept(layout, scale, points, total, first, second, key)
+    mesh.kept = replace(kept, first=first, second=second, key=key)
 
 
 def _step(shape: Shape) -> float:
