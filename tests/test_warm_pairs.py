@@ -123,7 +123,7 @@ def test_kept_pairs_lose_none_and_add_none(steps):
         anew, _ = pairs_of(mesh, vertices, None)
         known, after = pairs_of(mesh, vertices, kept)
         assert known == anew and len(anew) > 0
-        used += kept is not None and kept.first is not None and after is kept
+        used += kept is not None and kept.pairs is not None and after is kept
         kept = after
     assert used >= 2  # else nothing was tried
 
@@ -132,7 +132,7 @@ def test_few_groups_are_searched_where_the_body_moved_a_millimetre(monkeypatch):
     meshes, faces = body_steps(np.random.default_rng(2), 2)
     mesh = prepared(faces, len(meshes[0]))
     _, kept = pairs_of(mesh, meshes[0], None)
-    assert kept.first is None  # of a first mesh only its points
+    assert kept.pairs is None  # of a first mesh only its points
     _, kept = pairs_of(mesh, meshes[0], kept)
     searched, all_of_them = [], warm_pairs.across_groups
 
@@ -153,7 +153,7 @@ def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
     for _ in range(2):
         results(vertices, faces)
     kept = prepared(faces, len(vertices)).kept
-    size = kept.points.nbytes + kept.first.nbytes + kept.second.nbytes + kept.key.nbytes
+    size = kept.points.nbytes + kept.pairs.nbytes
     assert 0 < size < 200 * len(faces)
     gone = weakref.ref(kept)
     del kept
@@ -169,4 +169,4 @@ def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
             for _ in range(3):
                 assert results(vertices, faces) == expected
             kept = prepared(faces, len(vertices)).kept
-            assert kept is None or kept.first is None
+            assert kept is None or kept.pairs is None

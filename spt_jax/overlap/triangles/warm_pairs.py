@@ -62,18 +62,15 @@ class Kept:
         scale: what coordinates had been multiplied by.
         points: the vertices.
         growth: by how much two boxes together had been grown.
-        first, second: the slots of the pairs of different clusters whose grown boxes met; None
-            where only the points are kept.
-        key: of each pair, its groups as one number.
+        pairs: the slots of the pairs of different clusters whose grown boxes met, and of each the
+            two groups as one number; None where only the points are kept.
     """
 
     layout: Layout
     scale: float
     points: Float[np.ndarray, "3 V"]
     growth: float
-    first: Int32[np.ndarray, "N"] | None = None
-    second: Int32[np.ndarray, "N"] | None = None
-    key: Int32[np.ndarray, "N"] | None = None
+    pairs: Int32[np.ndarray, "3 N"] | None = None
 
 
 def warm_pairs(
@@ -109,17 +106,17 @@ def warm_pairs(
     if far.mean() > _FEW:
         yield from parts_of_size(across_groups(layout, shape, clusters, groups))
         mesh.kept = Kept(layout, scale, points, total)
-    elif kept.first is None:
+    elif kept is None or kept.pairs is None:
         yield from _kept_from(mesh, Kept(layout, scale, points, total), shape, clusters)
     else:
         groups = [(a[far], b[far])] if far.any() else []
         yield from parts_of_size(across_groups(layout, shape, clusters, groups))
         dropped = np.zeros(count * count, bool)
         dropped[a[far] * count + b[far]] = True
-        for part in pieces(len(kept.key), 1):
-            there = np.flatnonzero(~dropped.take(kept.key[part]))
-            pair = (x[part].take(there) for x in (kept.first, kept.second))
-            yield kept_meeting(shape, *pair)
+        for part in pieces(kept.pairs.shape[1], 1):
+            first, second, key = kept.pairs[:, part]
+            there = np.flatnonzero(~dropped.take(key))
+            yield kept_meeting(shape, first.take(there), second.take(there))
 
 
 def _kept_from(mesh: Prepared, kept: Kept, shape: Shape, clusters: Boxes):
@@ -138,9 +135,8 @@ def _kept_from(mesh: Prepared, kept: Kept, shape: Shape, clusters: Boxes):
         mesh.kept = None
         return
     first, second = concatenate(found) if found else np.zeros((2, 0), np.int64)
-    first, second = (x.astype(np.int32) for x in (first, second))
-    key = (first // _GROUP) * np.int32(count) + second // _GROUP
-    mesh.kept = replace(kept, first=first, second=second, key=key)
+    key = (first // _GROUP) * count + second // _GROUP
+    mesh.kept = replace(kept, pairs=np.stack([first, second, key]).astype(np.int32))
 
 
 def _step(shape: Shape) -> float:
