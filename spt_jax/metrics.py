@@ -1,0 +1,208 @@
+"""What papers and public filters report of motions: per frame, and of the whole."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from spt_jax.arguments import as_mesh
+from spt_jax.exclusions import as_exclusions
+from spt_jax.host_side import Work, measured
+from spt_jax.overlap.depth import penetration_depths
+from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.measure import Sampling, Unmeasurable, measure
+from spt_jax.rest_surface import RestSurface
+from spt_jax.result import Result, plain
+
+# The rule by which ProtoMotions leaves motions out: one frame this deep, or more than so many this
+# deep, in metres.
+TOO_DEEP, DEEP, MOST_DEEP_FRAMES = 0.05, 0.03, 10
+
+
+class MotionOverlap(Result):
+    """How much of a surface is in self-intersection, frame by frame.
+
+    Attributes:
+        volume: of each frame, the overlap volume that counts, in the cube of the unit.
+        ratio: the fraction of the vertices in overlaps that count (paper, Eq. 11).
+        intersecting_pairs: the number of face pairs that intersect and count.
+        largest_depth: how far the deepest vertex lies inside another part, in the unit; parts that
+            fold there do not count, also where the overlap goes on into one that does.
+        mean_depth: the mean of that over all vertices inside another part; 0 without any.
+
+    Example:
+        >>> import numpy as np
+        >>> from spt_jax.metrics import MotionOverlap
+        >>> deep = np.array([0.0, 0.02, 0.06])
+        >>> overlap = MotionOverlap(deep**2, deep, np.array([0, 5, 9]), deep, deep / 2)
+        >>> overlap.is_free.tolist(), overlap.is_rejected
+        ([True, False, False], True)
+    """
+
+    volume: Float[np.ndarray, "T"]
+    ratio: Float[np.ndarray, "T"]
+    intersecting_pairs: Int[np.ndarray, "T"]
+    largest_depth: Float[np.ndarray, "T"]
+    mean_depth: Float[np.ndarray, "T"]
+
+    @property
+    def is_free(self) -> Bool[np.ndarray, "T"]:
+        """Of each frame, whether no faces intersect and no parts overlap, where that counts."""
+        return (self.intersecting_pairs == 0) & ~(self.volume > 0)
+
+    @property
+    def is_rejected(self) -> bool:
+        """Whether a public filter of motions would leave this one out.
+
+        One frame deeper than 5 cm, or more than 10 frames deeper than 3 cm: the rule of
+        ProtoMotions (https://github.com/NVlabs/ProtoMotions), for a mesh in metres.
+        """
+        return rejected(self.largest_depth)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Figures of the whole, and lists over the frames, as JSON types."""
+        return {
+            "frames": len(self.volume),
+            "colliding_frames": int(np.count_nonzero(~self.is_free)),
+            "is_rejected": self.is_rejected,
+            "largest_volume": float(self.volume.max(initial=0.0)),
+            "largest_depth": float(self.largest_depth.max(initial=0.0)),
+            "per_frame": {
+                "is_free": plain(self.is_free),
+                "volume": plain(self.volume),
+                "ratio": plain(self.ratio),
+                "intersecting_pairs": plain(self.intersecting_pairs),
+                "largest_depth": plain(self.largest_depth),
+                "mean_depth": plain(self.mean_depth),
+            },
+        }
+
+
+def rejected(
+    largest_depth: Float[np.ndarray, "T"],
+    *,
+    too_deep: float = TOO_DEEP,
+    deep: float = DEEP,
+    most_deep_frames: int = MOST_DEEP_FRAMES,
+) -> bool:
+    """Whether a filter leaves a motion out: deeper than this once, or than that too often.
+
+    Args:
+        largest_depth: of each frame, in metres.
+        too_deep: no frame may be deeper, in metres.
+        deep: only so many frames may be deeper than this, in metres.
+        most_deep_frames: so many.
+
+    Returns:
+        Whether the motion would be left out.
+
+    Example:
+        >>> import numpy as np
+        >>> from spt_jax.metrics import rejected
+        >>> rejected(np.full(10, 0.04)), rejected(np.full(11, 0.04))
+        (False, True)
+    """
+    depth = np.asarray(largest_depth)
+    often = int(np.count_nonzero(depth > deep)) > most_deep_frames
+    return bool((depth > too_deep).any()) or often
+
+
+def motion_overlap(
+    vertices: Float[Array, "T V 3"] | np.ndarray,
+    faces: Int[Array, "F 3"] | np.ndarray,
+    *,
+    face_groups: Int[Array, "F"] | np.ndarray | None = None,
+    ignore_groups: Any = (),
+    rest_surface: RestSurface | None = None,
+) -> MotionOverlap:
+    """How much of a moving surface is in self-intersection, frame by frame, and how deep.
+
+    The depth of a vertex inside another part is its distance to the nearest triangle of the
+    surface that does not belong to the connected patch of vertices inside which it is in. It is
+    measured at the vertices: parts that intersect with no vertex inside have a depth of zero.
+
+    Args:
+        vertices: positions in each frame, in any unit; the public criterion takes it for metres.
+        faces: indices of each triangle's corners, counter-clockwise seen from outside.
+        face_groups, ignore_groups, rest_surface: what does not count, as in
+            `self_intersection_penalty`.
+
+    Returns:
+        The figures of each frame. Frames are measured in as many processes as there are cores.
+
+    Raises:
+        TypeError, ValueError: as `self_intersection_penalty`, and ValueError for a frame in which
+            there is no surface that could be measured.
+
+    Differentiation: none; for use outside jit.
+
+    Example:
+        >>> import numpy as np, trimesh
+        >>> from spt_jax.metrics import motion_overlap
+        >>> box, ball = trimesh.creation.box(), trimesh.creation.icosphere(radius=0.3)
+        >>> pair = trimesh.util.concatenate(box, ball)
+        >>> moving = np.repeat(pair.vertices[None], 2, axis=0)
+        >>> moving[1, 8:, 0] += 2.0  # the ball has left the box
+        >>> overlap = motion_overlap(moving, pair.faces)
+        >>> overlap.is_free.tolist(), overlap.largest_depth.round(2).tolist()
+        ([False, True], [0.5, 0.0])
+    """
+    points, triangles = as_mesh(vertices, faces)
+    if points.ndim != 3:
+        raise ValueError(f"vertices must have shape (frames, V, 3): got {tuple(points.shape)}.")
+    exclusions = as_exclusions(face_groups, ignore_groups, rest_surface, triangles)
+    return measured_frames(np.asarray(points), np.asarray(triangles), exclusions)
+
+
+class _Options(NamedTuple):
+    exclusions: Exclusions
+    rounding: float
+
+
+def measured_frames(
+    vertices: Float[np.ndarray, "T V 3"], faces: Int[np.ndarray, "F 3"], exclusions: Exclusions
+) -> MotionOverlap:
+    """`motion_overlap` of arrays that are known to fit each other.
+
+    Raises:
+        ValueError: as there.
+    """
+    options = _Options(exclusions, float(np.finfo(vertices.dtype).eps))
+    work = Work(_figures_on_host, options, (((5,), "float64"),))
+    (figures,) = measured(work, vertices, faces[None])
+    wrong = np.flatnonzero(np.isnan(figures).any(axis=1))
+    if len(wrong):
+        raise ValueError(
+            f"every frame must have a surface that can be measured: got none in {len(wrong)} of "
+            f"{len(vertices)}, frame {wrong[0]} the first; leave such frames out."
+        )
+    volume, ratio, pairs, largest, mean = figures.T
+    return MotionOverlap(volume, ratio, pairs.astype(np.int64), largest, mean)
+
+
+def _figures_on_host(vertices, faces, options: _Options):
+    """Volume, ratio, pairs, largest and mean depth; NaN where nothing can be measured."""
+    points, corners = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    sampling = Sampling(None, ((0.0, 0.0, 1.0),))
+    try:
+        found = measure(points, corners, sampling, options.exclusions, options.rounding)
+        volume, pairs = found.volume, found.intersecting_pairs
+        if not pairs and not volume > 0:
+            return (np.array([volume, 0.0, 0.0, 0.0, 0.0]),)
+        inside = found.labels("vertex") != 0
+    except Unmeasurable:
+        return (np.full(5, np.nan),)
+    depth = _depths(points, corners, inside, options.exclusions.rest)
+    largest, mean = (depth.max(), depth.mean()) if len(depth) else (0.0, 0.0)
+    return (np.array([volume, inside.mean(), pairs, largest, mean]),)
+
+
+def _depths(points, corners, inside, rest: RestSurface | None):
+    """How deep the vertices lie inside parts that are no folds of their own one."""
+    depth, nearest = penetration_depths(points, corners, inside)
+    at = np.flatnonzero(nearest >= 0)
+    if rest is not None and len(at):
+        beside = np.empty(len(points), np.int64)
+        beside[corners.reshape(-1)] = np.repeat(np.arange(len(corners)), 3)
+        at = at[~rest.near(beside[at], nearest[at])]
+    return depth[at]
