@@ -59,6 +59,27 @@ class MotionOverlap(Result):
         """
         return rejected(self.largest_depth)
 
+    def at(self, frames: Int[np.ndarray, "N"]) -> "MotionOverlap":
+        """The figures of some frames."""
+        return MotionOverlap(*(column[frames] for column in self.columns()))
+
+    def with_frames(self, frames: Int[np.ndarray, "N"], other: "MotionOverlap") -> "MotionOverlap":
+        """These figures, those of some frames replaced by other ones."""
+        columns = [column.copy() for column in self.columns()]
+        for column, found in zip(columns, other.columns(), strict=True):
+            column[frames] = found
+        return MotionOverlap(*columns)
+
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """All figures, in the order of the attributes."""
+        return (
+            self.volume,
+            self.ratio,
+            self.intersecting_pairs,
+            self.largest_depth,
+            self.mean_depth,
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Figures of the whole, and lists over the frames, as JSON types."""
         return {
@@ -157,17 +178,26 @@ def motion_overlap(
 class _Options(NamedTuple):
     exclusions: Exclusions
     rounding: float
+    depth: bool
 
 
 def measured_frames(
-    vertices: Float[np.ndarray, "T V 3"], faces: Int[np.ndarray, "F 3"], exclusions: Exclusions
+    vertices: Float[np.ndarray, "T V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    exclusions: Exclusions,
+    *,
+    depth: bool = True,
 ) -> MotionOverlap:
     """`motion_overlap` of arrays that are known to fit each other.
+
+    Args:
+        vertices, faces, exclusions: as there.
+        depth: whether ratio and depths are asked for; otherwise they are zero.
 
     Raises:
         ValueError: as there.
     """
-    options = _Options(exclusions, float(np.finfo(vertices.dtype).eps))
+    options = _Options(exclusions, float(np.finfo(vertices.dtype).eps), depth)
     work = Work(_figures_on_host, options, (((5,), "float64"),))
     (figures,) = measured(work, vertices, faces[None])
     wrong = np.flatnonzero(np.isnan(figures).any(axis=1))
@@ -187,8 +217,8 @@ def _figures_on_host(vertices, faces, options: _Options):
     try:
         found = measure(points, corners, sampling, options.exclusions, options.rounding)
         volume, pairs = found.volume, found.intersecting_pairs
-        if not pairs and not volume > 0:
-            return (np.array([volume, 0.0, 0.0, 0.0, 0.0]),)
+        if not options.depth or (not pairs and not volume > 0):
+            return (np.array([volume, 0.0, pairs, 0.0, 0.0]),)
         inside = found.labels("vertex") != 0
     except Unmeasurable:
         return (np.full(5, np.nan),)

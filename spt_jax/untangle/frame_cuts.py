@@ -1,0 +1,179 @@
+"""The least smooth correction of a run of frames that clears what is known of their collisions.
+
+A correction has one vector y_t a frame. Its cost is that of a smooth prior,
+
+    sum over t of |y_t|^2 + 2 s^2 |y_t+1 - y_t|^2 + s^4 |y_t+1 - 2 y_t + y_t-1|^2 = y' (K x I) y,
+
+the energy |y - s^2 y''|^2 whose answer to a push in one frame is (1 + |t| / s) exp(-|t| / s): it
+fades over s frames and never swings to the other side (a Matérn kernel of order 3/2). Collisions
+are known by cuts, planes under the convex functions c_t(y_t) that the roots of the penalties nearly
+are (`contact_solver`). What is sought is
+
+    min over y of y' (K x I) y + sum over t of w_t max(0, h_k + s_k . y_t for every cut k of t)^2.
+
+Its dual has one weight a cut, not negative, and the matrix S (K^-1 x I) S' + 1 / w of cuts of one
+frame: frames meet only in K^-1, of which there is one small matrix, so that nothing of the size of
+the whole correction is ever solved.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+# Cuts of one frame that are kept, the latest ones.
+_CUTS = 5
+
+# Of the dual's diagonal, added so that equal cuts can be solved for.
+_RIDGE = 1e-9
+
+# Rounds of pivoting in blocks; and how many without progress before it goes one by one, which ends.
+_ROUNDS, _PATIENCE = 300, 5
+
+
+class Prior(NamedTuple):
+    """The smooth prior of a window, given what is fixed around it.
+
+    Attributes:
+        kernel: K^-1 of the frames that are free.
+        mean: the correction without any cuts, which the frames fixed before pass on.
+    """
+
+    kernel: Float[np.ndarray, "T T"]
+    mean: Float[np.ndarray, "T N"]
+
+
+def prior(
+    fixed_before: Float[np.ndarray, "B N"],
+    free: int,
+    fixed_after: int,
+    smoothness: float,
+) -> Prior:
+    """The prior of `free` frames between frames whose correction is known.
+
+    Args:
+        fixed_before: corrections of the frames before; none where the motion begins there.
+        free: how many frames there are to be found.
+        fixed_after: how many frames after have no correction; none where the motion ends there, or
+            the rest of it is found later.
+        smoothness: s, in frames.
+    """
+    before = len(fixed_before)
+    count = before + free + fixed_after
+    matrix = np.eye(count)
+    for order, factor in ((1, 2 * smoothness**2), (2, smoothness**4)):
+        if count > order:
+            difference = np.diff(np.eye(count), n=order, axis=0)
+            matrix += factor * difference.T @ difference
+    chosen = slice(before, before + free)
+    kernel = np.linalg.inv(matrix[chosen, chosen])
+    kernel = (kernel + kernel.T) / 2
+    return Prior(kernel, -kernel @ (matrix[chosen, :before] @ fixed_before))
+
+
+class FrameCuts:
+    """What is known of the collisions of a window's frames."""
+
+    def __init__(self, size: int):
+        self.frame = np.zeros(0, np.int64)
+        self.slope = np.zeros((0, size))
+        self.height = np.zeros(0)
+        self.weight = np.zeros(0)
+
+    def learn(
+        self,
+        frame: Int[np.ndarray, "F"],
+        place: Float[np.ndarray, "F N"],
+        squared: Float[np.ndarray, "F"],
+        gradient: Float[np.ndarray, "F N"],
+    ) -> None:
+        """What was found at one place of each of some frames: c^2 and its gradient.
+
+        A cut that said more than was found is lowered; the oldest ones of a frame go.
+        """
+        root = np.sqrt(np.maximum(squared, 0.0))
+        found = np.full(int(max(self.frame.max(initial=-1), frame.max(initial=-1))) + 1, -1)
+        found[frame] = np.arange(len(frame))
+        known = np.flatnonzero(found[self.frame] >= 0)
+        at = found[self.frame[known]]
+        said = self.height[known] + np.einsum("cn,cn->c", self.slope[known], place[at])
+        self.height[known] -= np.maximum(said - root[at], 0.0)
+        fresh = np.flatnonzero(root > 0)
+        slope = gradient[fresh] / (2 * root[fresh, None])
+        self.frame = np.concatenate([self.frame, frame[fresh]])
+        self.slope = np.concatenate([self.slope, slope])
+        height = root[fresh] - np.einsum("cn,cn->c", slope, place[fresh])
+        self.height = np.concatenate([self.height, height])
+        self.weight = np.concatenate([self.weight, np.zeros(len(fresh))])
+        self._keep(self._latest())
+
+    def _latest(self) -> Bool[np.ndarray, "C"]:
+        count = len(self.frame)
+        order = np.lexsort((-np.arange(count), self.frame))
+        sorted_frames = self.frame[order]
+        kept = np.zeros(count, bool)
+        # How many of the same frame are later than it.
+        kept[order] = np.arange(count) - np.searchsorted(sorted_frames, sorted_frames) < _CUTS
+        return kept
+
+    def _keep(self, kept: Bool[np.ndarray, "C"]) -> None:
+        self.frame, self.slope = self.frame[kept], self.slope[kept]
+        self.height, self.weight = self.height[kept], self.weight[kept]
+
+    def minimum(self, known: Prior, stiffness: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T N"]:
+        """The correction at which the cost over all cuts is least.
+
+        Args:
+            known: the prior.
+            stiffness: w_t of each frame.
+        """
+        if not len(self.frame):
+            return known.mean
+        reach = np.einsum("cn,cn->c", self.slope, known.mean[self.frame])
+        matrix = (self.slope @ self.slope.T) * known.kernel[np.ix_(self.frame, self.frame)]
+        same = self.frame[:, None] == self.frame
+        matrix += np.where(same, 1 / stiffness[self.frame], 0.0)
+        matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
+        self.weight = nonnegative_minimum(matrix, 2 * (self.height + reach), self.weight > 0)
+        pull = np.zeros_like(known.mean)
+        np.add.at(pull, self.frame, self.weight[:, None] * self.slope)
+        return known.mean - 0.5 * known.kernel @ pull
+
+
+def nonnegative_minimum(
+    matrix: Float[np.ndarray, "C C"],
+    wanted: Float[np.ndarray, "C"],
+    positive: Bool[np.ndarray, "C"],
+) -> Float[np.ndarray, "C"]:
+    """a >= 0 at which a' M a / 2 - a . wanted is least, M positive definite.
+
+    By pivoting in blocks (Júdice and Pires 1994): those that are held at zero and those that are
+    not change sides all at once while that leaves fewer and fewer on the wrong one, and otherwise
+    only the last of them, which comes to an end.
+
+    Args:
+        matrix: M.
+        wanted: what M a would be, were all positive.
+        positive: a first guess of where a is.
+    """
+    positive = positive.copy()
+    fewest, patience = len(wanted) + 1, _PATIENCE
+    size = np.abs(wanted).max(initial=0.0)
+    found = np.zeros_like(wanted)
+    for _ in range(_ROUNDS):
+        at = np.flatnonzero(positive)
+        found = np.zeros_like(wanted)
+        if len(at):
+            found[at] = np.linalg.solve(matrix[np.ix_(at, at)], wanted[at])
+        left = wanted - matrix @ found
+        wrong = np.flatnonzero(np.where(positive, found < 0, left > 1e-9 * size))
+        if not len(wrong):
+            break
+        if len(wrong) < fewest:
+            fewest, patience = len(wrong), _PATIENCE
+        elif patience:
+            patience -= 1
+        else:
+            wrong = wrong[-1:]
+        positive[wrong] = ~positive[wrong]
+    return np.maximum(found, 0.0)
