@@ -1,5 +1,6 @@
 """Small turns of a motion's joints, what they move, and what is left of the overlap after them."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -36,13 +37,24 @@ class Frames(NamedTuple):
         translation: of each frame, in metres.
     """
 
-    pose: Float[Array, "T J 3"]
-    shape: Float[Array, "T B"]
-    translation: Float[Array, "T 3"]
+    pose: Float[Array, "T J 3"] | Float[np.ndarray, "T J 3"]
+    shape: Float[Array, "T B"] | Float[np.ndarray, "T B"]
+    translation: Float[Array, "T 3"] | Float[np.ndarray, "T 3"]
 
     def at(self, frames: Int[np.ndarray, "N"]) -> "Frames":
-        """Some of them."""
-        return Frames(*(array[jnp.asarray(frames)] for array in self))
+        """Some of them, in arrays of NumPy: any number of frames is taken without a program."""
+        return Frames(*(np.asarray(array)[frames] for array in self))
+
+    def batches(self) -> Iterator[tuple[int, "Frames"]]:
+        """All of them in batches of one size, so that one program does for any number.
+
+        Returns:
+            Of each batch how many frames are new; the last one fills it up.
+        """
+        count = len(self.pose)
+        for start in range(0, count, BATCH):
+            at = np.minimum(np.arange(start, start + BATCH), count - 1)
+            yield min(BATCH, count - start), self.at(at)
 
 
 def corrected(
@@ -184,7 +196,7 @@ class Corrections(NamedTuple):
         turns = self.turns(vectors)
         values, gradients = [], []
         for start in range(0, len(chosen), BATCH):
-            # The last one again, which is measured once, so that one program does for any number.
+            # The last one again, which is measured once: one program does for any number.
             at = np.minimum(np.arange(start, start + BATCH), len(chosen) - 1)
             dtype = self.frames.pose.dtype
             value, gradient = _overlaps(

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -53,7 +52,11 @@ def standing_feet(
     if not len(feet):
         return Standing(feet, np.zeros((len(frames.pose), 0)))
     known = tuple(tuple(np.flatnonzero(foot).tolist()) for foot in feet)
-    lowest, soles, middles = (np.asarray(x) for x in _heights(body, frames, known, np.array(up)))
+    parts = [
+        [np.asarray(x)[:count] for x in _heights(body, batch, known, up.astype(frames.pose.dtype))]
+        for count, batch in frames.batches()
+    ]
+    lowest, soles, middles = (np.concatenate(x) for x in zip(*parts, strict=True))
     ground = lowest.min() if on_ground else lowest
     low = soles - np.reshape(ground, (-1, 1)) < LOW
     if on_ground and len(middles) > 1:
@@ -85,11 +88,8 @@ def _is_below(parents: tuple[int, ...], joint: int, ancestor: int) -> bool:
 def _heights(body, frames: Frames, feet: tuple[tuple[int, ...], ...], up):
     """Of each frame the lowest place, that of each foot, and the middle of each foot."""
 
-    def of(frame):
-        vertices = body(*frame).vertices
-        height = vertices @ up.astype(vertices.dtype)
-        soles = [height[np.array(foot)].min() for foot in feet]
-        middles = [vertices[np.array(foot)].mean(axis=0) for foot in feet]
-        return height.min(), jnp.stack(soles), jnp.stack(middles)
-
-    return jax.lax.map(of, tuple(frames))
+    vertices = body(*frames).vertices
+    height = vertices @ up
+    soles = [height[:, np.array(foot)].min(axis=1) for foot in feet]
+    middles = [vertices[:, np.array(foot)].mean(axis=1) for foot in feet]
+    return height.min(axis=1), jnp.stack(soles, axis=1), jnp.stack(middles, axis=1)

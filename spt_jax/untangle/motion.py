@@ -203,9 +203,7 @@ def _after(body, frames: Frames, pose, moved, before: MotionOverlap, exclusions)
     at = np.flatnonzero(moved)
     if not len(at):
         return before
-    found = measured_poses(
-        body, frames.at(at)._replace(pose=jnp.asarray(pose[at])), exclusions, depth=True
-    )
+    found = measured_poses(body, frames.at(at)._replace(pose=pose[at]), exclusions, depth=True)
     return before.with_frames(at, found)
 
 
@@ -224,7 +222,8 @@ def _as_frames(body: BodyModel, poses: Any, shape: Any, translation: Any) -> Fra
     shapes = _per_frame("shape", shape, len(pose), body.num_shape if shape is None else None)
     places = _per_frame("translation", translation, len(pose), 3)
     _check_finite(poses=pose, shape=shapes, translation=places)
-    return Frames(pose, shapes.astype(pose.dtype), places.astype(pose.dtype))
+    dtype = pose.dtype
+    return Frames(np.asarray(pose), np.asarray(shapes, dtype), np.asarray(places, dtype))
 
 
 def _per_frame(name: str, array: Any, count: int, size: int | None) -> Float[Array, "T B"]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax.metrics import MotionOverlap, measured_frames
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.untangle.corrections import BATCH, Corrections, posed
+from spt_jax.untangle.corrections import Corrections, posed
 from spt_jax.untangle.frame_cuts import FrameCuts, Prior
 
 # Rounds over a window. What a collision weighs, per cm^3 against cm^2, is first weak, so that poses
@@ -203,10 +203,8 @@ def measured_poses(body, frames, exclusions: Exclusions, *, depth: bool) -> Moti
     """The overlap of each frame; as `spt_jax.metrics` measures it."""
     faces = np.asarray(body.faces, np.int64)
     parts = []
-    for start in range(0, len(frames.pose), BATCH):
-        at = np.minimum(np.arange(start, start + BATCH), len(frames.pose) - 1)
-        vertices = np.asarray(posed(body, frames.at(at)))
-        count = min(BATCH, len(frames.pose) - start)
+    for count, batch in frames.batches():
+        vertices = np.asarray(posed(body, batch))
         found = measured_frames(vertices[:count], faces, exclusions, depth=depth)
         parts.append(found.columns())
     return MotionOverlap(*(np.concatenate(column) for column in zip(*parts, strict=True)))
