@@ -45,6 +45,9 @@ if typing.TYPE_CHECKING:
     from spt_jax.status import RESULTS as RESULTS
     from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
     from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
+    from spt_jax.untangle.motion import MotionResult as MotionResult
+    from spt_jax.untangle.motion import MotionStep as MotionStep
+    from spt_jax.untangle.motion import untangle_motion as untangle_motion
     from spt_jax.untangle.pose import UntangleResult as UntangleResult
     from spt_jax.untangle.pose import untangle_pose as untangle_pose
     from spt_jax.untangle.steps import Step as Step
@@ -61,6 +64,8 @@ __all__ = [
     "IntersectionReport",
     "KeypointRegressor",
     "MeshCheck",
+    "MotionResult",
+    "MotionStep",
     "Overlap",
     "Penetration",
     "PeopleResult",
@@ -91,6 +96,7 @@ __all__ = [
     "read_keypoints",
     "self_intersection_penalty",
     "untangle_mesh",
+    "untangle_motion",
     "untangle_pose",
     "within_groups",
 ]
@@ -136,6 +142,9 @@ __getattr__, __dir__ = lazy_names(
         "load_poses": "spt_jax.pose_files",
         "read_keypoints": "spt_jax.keypoints",
         "untangle_mesh": "spt_jax.untangle.mesh",
+        "MotionResult": "spt_jax.untangle.motion",
+        "MotionStep": "spt_jax.untangle.motion",
+        "untangle_motion": "spt_jax.untangle.motion",
         "untangle_pose": "spt_jax.untangle.pose",
         # The namespaces.
         "fit": "",

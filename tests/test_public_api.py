@@ -15,6 +15,8 @@ NAMES = [
     "IntersectionReport",
     "KeypointRegressor",
     "MeshCheck",
+    "MotionResult",
+    "MotionStep",
     "Overlap",
     "Penetration",
     "PeopleResult",
@@ -45,6 +47,7 @@ NAMES = [
     "read_keypoints",
     "self_intersection_penalty",
     "untangle_mesh",
+    "untangle_motion",
     "untangle_pose",
     "within_groups",
 ]
@@ -69,6 +72,9 @@ PARAMETERS = {
     "read_keypoints": "path, *, layout=None, max_bytes=None",
     "load_body": "source='anny', *, num_shape=10, dtype=None, max_bytes=None",
     "load_mocap": "",
+    "untangle_motion": "body, poses, *, shape=None, translation=None, frames_per_second=30.0,"
+    " fade=0.1, fold_distance=None, margin=0.002, feet=1.0, up=(0.0, 1.0, 0.0), tolerance=1e-09,"
+    " on_step=None",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"
     " rays=None, directions=3, weights=(0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),"

@@ -1,7 +1,7 @@
 """Freeing a motion of its collisions as a whole, so that what was smooth stays smooth."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,23 @@ _REACH = 5.0
 # The most frames for which one correction is found at once: so many of the same units, or at least
 # so many frames.
 _LONGEST, _SHORTEST = 60.0, 64
+
+
+class MotionStep(NamedTuple):
+    """One round of `untangle_motion` over a window: frames before `first` are done.
+
+    Attributes:
+        first, end: the window's first frame, and the one after its last.
+        round: how many corrections of the window were tried.
+        colliding: how many of its frames still collide.
+        frames: how many frames the motion has.
+    """
+
+    first: int
+    end: int
+    round: int
+    colliding: int
+    frames: int
 
 
 class MotionResult(Result):
@@ -85,8 +102,7 @@ def untangle_motion(
     feet: float = 1.0,
     up: Any = (0.0, 1.0, 0.0),
     tolerance: float = 1e-9,
-    on_step: Callable[[int, int, int, int], None] | None = None,
-    on_frames: Callable[[int, int], None] | None = None,
+    on_step: Callable[[MotionStep], None] | None = None,
 ) -> MotionResult:
     """The motion nearest to the one given in which no body parts collide, as smooth as it was.
 
@@ -119,9 +135,8 @@ def untangle_motion(
             has one weight, its mean.
         up: the direction that is up.
         tolerance: an overlap of this volume or less, in m^3, is none where nothing intersects.
-        on_step: called after each round over a window with the window's first frame, the one after
-            its last, the round and how many of its frames still collide.
-        on_frames: called with how many frames are done, and how many there are.
+        on_step: called with a `MotionStep` after each round over a window; what it raises ends the
+            search.
 
     Returns:
         The poses with the fewest frames that collide of those measured in each window, never more
@@ -150,7 +165,7 @@ def untangle_motion(
     smoothness = _as_positive("fade", fade) * rate
     apart, weight = as_margin(margin), _as_positive("feet", feet, zero=True)
     exclusions = Exclusions(rest=as_fold_surface(body, fold_distance))
-    step, done = on_step or _nothing, on_frames or _nothing
+    report = on_step or _nothing
     count = len(frames.pose)
     before = measured_poses(body, frames, exclusions, depth=True)
     colliding = (before.intersecting_pairs > 0) | (before.volume > tolerance)
@@ -160,7 +175,6 @@ def untangle_motion(
     longest = max(int(_LONGEST * smoothness), 4 * reach, _SHORTEST)
     rounds = 0
     for first, end, kept, closed in windows(colliding, reach, longest):
-        done(first, count)
         chosen = np.arange(first, end)
         part, share = frames.at(chosen), weight * standing.share[chosen]
         factor = displacement_factor(body, part, standing.feet, share)
@@ -174,13 +188,12 @@ def untangle_motion(
             exclusions,
             apart,
             float(tolerance),
-            lambda number, left, first=first, end=end: step(first, end, number, left),
+            lambda number, left, at=(first, end): report(MotionStep(*at, number, left, count)),
         )
         keep = slice(0, kept - first)
         pose[first:kept] = solved.pose[keep]
         turns[first:kept] = corrections.turns(solved.vectors)[keep]
         rounds += solved.rounds
-    done(count, count)
     moved = np.any(turns != 0, axis=(1, 2))
     after = _after(body, frames, pose, moved, before, exclusions)
     free = (after.intersecting_pairs == 0) & (after.volume <= tolerance)
@@ -266,5 +279,5 @@ def _as_up(up: Any) -> Float[np.ndarray, "3"]:
     return direction / np.linalg.norm(direction)
 
 
-def _nothing(*_: int) -> None:
+def _nothing(step: MotionStep) -> None:
     pass

@@ -1,0 +1,339 @@
+"""Motions freed as a whole, frame by frame, and smoothed: `python -m benchmarks.untangle_motion`.
+
+Each motion at its own rate and interpolated to four times that, as splines of rotations. Whether a
+frame is free is ipctk's to say (`oracles.py`), of 30 frames a second; how smooth a motion is, is
+told by the second differences of its skin's vertices.
+"""
+
+import multiprocessing
+import os
+import pickle
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from benchmarks.common import Table, progress, provenance, record_section
+from benchmarks.oracles import FAR, RestGraph, far_crossings
+from spt_jax import load_body, load_mocap, untangle_motion, untangle_pose
+from spt_jax.untangle.corrections import Frames, corrected
+from spt_jax.untangle.feet import standing_feet
+
+# What the recordings are taken for, in frames a second.
+RATE = 30
+# Of the Gaussian over the correction, in seconds.
+SMOOTHED = 0.05
+METHODS = ("as a whole", "frame by frame", "frame by frame, smoothed")
+
+
+@dataclass
+class Settings:
+    """Which motions are freed."""
+
+    motions: tuple[str, ...] = ()
+    """By name; none: all eleven."""
+    finer: tuple[int, ...] = (1, 4)
+    """How many times as many frames a second."""
+    processes: int = 2
+    """Each on one core, with motions of its own."""
+    kept: Path | None = None
+    """A folder in which what is done is kept, and found again."""
+    record: bool = False
+    """Write the tables into results.md."""
+
+
+class Freed(NamedTuple):
+    """What one way made of one motion; lengths in metres.
+
+    Attributes:
+        free: of the frames that were judged, which have no far crossing.
+        largest: of each frame but two, the largest second difference of a vertex.
+        moved: of each frame, the mean displacement of the vertices.
+        slide: of each frame but one in which a foot stands, how much farther than in the motion
+            given it went.
+        seconds: of one core, over all frames.
+    """
+
+    free: np.ndarray
+    largest: np.ndarray
+    moved: np.ndarray
+    slide: np.ndarray
+    seconds: float
+
+
+class Done(NamedTuple):
+    """One motion at one rate, and what became of it."""
+
+    name: str
+    rate: int
+    colliding: np.ndarray
+    largest: np.ndarray
+    rejected: tuple[bool, bool]
+    ways: dict[str, Freed]
+
+
+@cache
+def _world():
+    if hasattr(os, "sched_setaffinity"):  # one core: no workers, and its time is all the time
+        os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[os.getpid() % 2]})
+    body = load_body()
+    graph = RestGraph.of_body(body)
+    warm = motion("cartwheel", 1)[100:104]
+    untangle_motion(body, warm)
+    untangle_pose(body, warm[0])
+    return body, np.asarray(body.faces, np.int64), graph
+
+
+def motion(name: str, finer: int) -> np.ndarray:
+    """The poses of a motion, interpolated."""
+    mocap = load_mocap()
+    chosen = [k for k, one in enumerate(mocap.names) if one.split("/")[0] == name]
+    pose = np.asarray(load_body().pose_from_smpl(jnp.asarray(mocap.pose[chosen])))
+    if finer == 1:
+        return pose
+    known, wanted = np.arange(len(pose)), np.arange((len(pose) - 1) * finer + 1) / finer
+    found = np.zeros((len(wanted), *pose.shape[1:]))
+    for joint in range(pose.shape[1]):
+        if pose[:, joint].any():
+            spline = RotationSpline(known, Rotation.from_rotvec(pose[:, joint]))
+            found[:, joint] = spline(wanted).as_rotvec()
+    return found.astype(np.float32)
+
+
+def freed(task: tuple[str, int, Path | None]) -> Done:
+    """One motion in all three ways."""
+    name, finer, kept = task
+    path = None if kept is None else kept / f"{name}_{finer}.pkl"
+    if path is not None and path.exists():
+        return pickle.loads(path.read_bytes())
+    body, _, _ = _world()
+    given, rate = motion(name, finer), RATE * finer
+    start = time.process_time()
+    whole = untangle_motion(body, given, frames_per_second=rate)
+    middle = time.process_time()
+    single = np.array(untangle_pose(body, jnp.asarray(given)).pose)
+    end = time.process_time()
+    found = {
+        METHODS[0]: (np.asarray(whole.pose), middle - start),
+        METHODS[1]: (single, end - middle),
+        METHODS[2]: (_smoothed(given, single, SMOOTHED * rate), end - middle),
+    }
+    vertices = _vertices(given)
+    standing = standing_feet(
+        body, _frames(given), float(rate), np.array([0.0, 1.0, 0.0]), on_ground=False
+    )
+    judged = np.arange(finer // 2, len(given), finer)
+    before = _far(vertices[judged])
+    done = Done(
+        name,
+        rate,
+        ~whole.before.is_free,
+        _largest(vertices),
+        (whole.before.is_rejected, whole.after.is_rejected),
+        {
+            way: _judged(given, *one, vertices, standing, judged, before)
+            for way, one in found.items()
+        },
+    )
+    if path is not None:
+        path.write_bytes(pickle.dumps(done))
+    return done
+
+
+def _judged(given, pose, seconds, vertices, standing, judged, before) -> Freed:
+    after = _vertices(pose)
+    free = before == 0
+    changed = (pose != given).any(axis=(1, 2))[judged]
+    free[changed] = _far(after[judged][changed]) == 0
+    slide = []
+    for foot, share in zip(standing.feet, standing.share.T, strict=True):
+        step = [
+            np.linalg.norm(np.diff(v[:, foot].mean(axis=1), axis=0), axis=1)
+            for v in (vertices, after)
+        ]
+        slide.append((step[1] - step[0])[(share[1:] > 0) & (share[:-1] > 0)])
+    moved = np.linalg.norm(after - vertices, axis=-1).mean(axis=1)
+    return Freed(free, _largest(after), moved, np.concatenate(slide), seconds)
+
+
+def _far(vertices) -> np.ndarray:
+    _, faces, graph = _world()
+    return np.array([far_crossings(v.astype(np.float64), faces, graph).num_far for v in vertices])
+
+
+def _smoothed(given, pose, sigma: float) -> np.ndarray:
+    """The motion given with the correction of each frame smoothed over time."""
+    turn = np.zeros_like(given[:, 1:])
+    for joint in range(1, given.shape[1]):
+        first, second = (
+            Rotation.from_rotvec(p[:, joint].astype(np.float64)) for p in (given, pose)
+        )
+        turn[:, joint - 1] = (first.inv() * second).as_rotvec()
+    smooth = gaussian_filter1d(turn, sigma, axis=0, mode="nearest")
+    found = np.asarray(corrected(jnp.asarray(given), jnp.asarray(smooth)))
+    return np.where(smooth.any(axis=(1, 2))[:, None, None], found, given)
+
+
+def _frames(pose) -> Frames:
+    body = _world()[0]
+    return Frames(
+        pose,
+        np.zeros((len(pose), body.num_shape), np.float32),
+        np.zeros((len(pose), 3), np.float32),
+    )
+
+
+def _vertices(pose) -> np.ndarray:
+    body = _world()[0]
+    parts = [np.asarray(body(b.pose).vertices)[:n] for n, b in _frames(pose).batches()]
+    return np.concatenate(parts)
+
+
+def _largest(vertices) -> np.ndarray:
+    return np.linalg.norm(np.diff(vertices, n=2, axis=0), axis=-1).max(axis=1, initial=0.0)
+
+
+def tables(runs: list[Done]) -> list[Table]:
+    """Each rate's motions: summed up by way, and one by one."""
+    found = []
+    for rate in sorted({run.rate for run in runs}):
+        these = [run for run in runs if run.rate == rate]
+        found += [_summary(rate, these), _each(rate, these)]
+    return found
+
+
+def _ratios(run: Done, way: str) -> tuple[float, float]:
+    after = run.ways[way].largest
+    return after.max() / run.largest.max(), np.quantile(after, 0.95) / np.quantile(
+        run.largest, 0.95
+    )
+
+
+def _summary(rate: int, runs: list[Done]) -> Table:
+    frames = sum(len(run.colliding) for run in runs)
+    touched = [run for run in runs if run.colliding.any()]
+    rows = []
+    for way in METHODS:
+        ways = [run.ways[way] for run in runs]
+        free = np.concatenate([one.free for one in ways])
+        ratio = np.array([_ratios(run, way) for run in touched])
+        here = np.concatenate([run.ways[way].moved[run.colliding] for run in touched])
+        everywhere = np.concatenate([one.moved for one in ways])
+        slide = np.concatenate([one.slide for one in ways])
+        speed = np.median([2 * len(run.colliding) / run.ways[way].seconds for run in touched])
+        rows.append(
+            (
+                way,
+                f"{free.mean():.2%} of {len(free)}",
+                f"{ratio[:, 0].max():.2f}",
+                f"{ratio[:, 1].max():.2f}",
+                f"{1e3 * here.mean():.1f}",
+                f"{1e3 * everywhere.mean():.2f}",
+                f"{1e3 * slide.max(initial=0.0):.2f}",
+                f"{speed:.1f}",
+            )
+        )
+    rejected = [sum(run.rejected[k] for run in runs) for k in (0, 1)]
+    return Table(
+        f"{len(runs)} motions at {rate} frames a second, {frames} frames, "
+        f"{sum(int(run.colliding.sum()) for run in runs)} collide; the public rule leaves out "
+        f"{rejected[0]} of the motions before and {rejected[1]} after being freed as a whole",
+        (
+            "way",
+            f"frames without a crossing farther than {FAR:g} m",
+            "largest second difference, after / before, worst motion",
+            "95 % quantile over frames, likewise",
+            "mean displacement of colliding frames, mm",
+            "of all frames, mm",
+            "a standing foot's step longer by at most, mm a frame",
+            "frames a second on two cores, median",
+        ),
+        rows,
+    )
+
+
+def _each(rate: int, runs: list[Done]) -> Table:
+    rows = []
+    for run in runs:
+        for way in METHODS:
+            one, ratio = run.ways[way], _ratios(run, way)
+            here = one.moved[run.colliding]
+            rows.append(
+                (
+                    f"{run.name}, {way}",
+                    f"{int(run.colliding.sum())} of {len(run.colliding)}",
+                    f"{int(one.free.sum())} of {len(one.free)}",
+                    f"{1e3 * run.largest.max():.1f}",
+                    f"{1e3 * one.largest.max():.1f}",
+                    f"{ratio[1]:.2f}",
+                    f"{1e3 * here.mean() if len(here) else 0:.1f}",
+                    f"{2 * len(run.colliding) / one.seconds:.1f}",
+                )
+            )
+    return Table(
+        f"Motion by motion, {rate} frames a second",
+        (
+            "motion",
+            "frames that collide",
+            "free afterwards, of those judged",
+            "largest second difference before, mm",
+            "after",
+            "95 % quantile, after / before",
+            "mean displacement of colliding frames, mm",
+            "frames a second",
+        ),
+        rows,
+    )
+
+
+def main(settings: Settings) -> None:
+    """Free the motions and print the tables."""
+    lengths = Counter(name.split("/")[0] for name in load_mocap().names)
+    names = settings.motions or tuple(sorted(lengths, key=lambda name: lengths[name]))
+    if settings.kept is not None:
+        settings.kept.mkdir(parents=True, exist_ok=True)
+    tasks = [(name, finer, settings.kept) for finer in settings.finer for name in names]
+    runs = []
+    # Forked processes would inherit JAX's threads without the threads.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(settings.processes, mp_context=context) as pool, progress() as bar:
+        shown = bar.add_task("freeing", total=len(tasks))
+        for run in pool.map(freed, tasks):
+            runs.append(run)
+            bar.advance(shown)
+    parts = tables(runs)
+    for table in parts:
+        table.print()
+    if settings.record:
+        chosen = "".join(f" --motions {' '.join(settings.motions)}" if settings.motions else "")
+        command = (
+            f"python -m benchmarks.untangle_motion{chosen} --finer "
+            f"{' '.join(map(str, settings.finer))} --record"
+        )
+        record_section("untangle_motion", "Untangling motions", _text(command, parts))
+
+
+def _text(command: str, parts: list[Table]) -> str:
+    return "\n\n".join(
+        [
+            provenance(command),
+            "Default settings. Second differences are those of the skin's vertices from frame to "
+            "frame; the recordings have no place of the root, so feet stand where they are within "
+            f"5 cm of the lowest vertex. Smoothed: a Gaussian of {SMOOTHED:g} s over the turns "
+            "that freed each frame. Times are of processor cores, after compiling, one motion a core.",
+            *(table.markdown() for table in parts),
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))
