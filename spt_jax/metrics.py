@@ -168,11 +168,12 @@ def motion_overlap(
         >>> overlap.is_free.tolist(), overlap.largest_depth.round(2).tolist()
         ([False, True], [0.5, 0.0])
     """
-    points, triangles = as_mesh(vertices, faces)
-    if points.ndim != 3:
-        raise ValueError(f"vertices must have shape (frames, V, 3): got {tuple(points.shape)}.")
+    checked, triangles = as_mesh(vertices, faces)
+    if checked.ndim != 3:
+        raise ValueError(f"vertices must have shape (frames, V, 3): got {tuple(checked.shape)}.")
     exclusions = as_exclusions(face_groups, ignore_groups, rest_surface, triangles)
-    return measured_frames(np.asarray(points), np.asarray(triangles), exclusions)
+    # As they are given: without 64 bits JAX would round them.
+    return measured_frames(np.asarray(vertices), np.asarray(triangles), exclusions)
 
 
 class _Options(NamedTuple):
