@@ -149,10 +149,10 @@ def freed(task: tuple[str, int, Path | None]) -> Done:
     return done
 
 
-def _judged(given, pose, seconds, vertices, standing, judged, before) -> Freed:
+def _judged(given, pose: np.ndarray, seconds, vertices, standing, judged, before) -> Freed:
     after = _vertices(pose)
     free = before == 0
-    changed = (pose != given).any(axis=(1, 2))[judged]
+    changed = np.any(pose != given, axis=(1, 2))[judged]
     free[changed] = _far(after[judged][changed]) == 0
     slide = []
     for foot, share in zip(standing.feet, standing.share.T, strict=True):
@@ -329,7 +329,7 @@ def _text(command: str, parts: list[Table]) -> str:
             "Default settings. Second differences are those of the skin's vertices from frame to "
             "frame; the recordings have no place of the root, so feet stand where they are within "
             f"5 cm of the lowest vertex. Smoothed: a Gaussian of {SMOOTHED:g} s over the turns "
-            "that freed each frame. Times are of processor cores, after compiling, one motion a core.",
+            "that freed each frame. Times are of processor cores, after compiling, a motion a core.",
             *(table.markdown() for table in parts),
         ]
     )

@@ -9,6 +9,7 @@ if typing.TYPE_CHECKING:
     from spt_jax import fit as fit
     from spt_jax import io as io
     from spt_jax import keypoints as keypoints
+    from spt_jax import metrics as metrics
     from spt_jax import show as show
     from spt_jax import xla as xla
     from spt_jax.body import BodyModel as BodyModel
@@ -150,6 +151,7 @@ __getattr__, __dir__ = lazy_names(
         "fit": "",
         "io": "",
         "keypoints": "",
+        "metrics": "",
         "show": "",
         "xla": "",
     },

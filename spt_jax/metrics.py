@@ -14,6 +14,8 @@ from spt_jax.overlap.measure import Sampling, Unmeasurable, measure
 from spt_jax.rest_surface import RestSurface
 from spt_jax.result import Result, plain
 
+__all__ = ["MotionOverlap", "motion_overlap", "rejected"]
+
 # The rule by which ProtoMotions leaves motions out: one frame this deep, or more than so many this
 # deep, in metres.
 TOO_DEEP, DEEP, MOST_DEEP_FRAMES = 0.05, 0.03, 10
@@ -149,7 +151,7 @@ def motion_overlap(
             `self_intersection_penalty`.
 
     Returns:
-        The figures of each frame. Frames are measured in as many processes as there are cores.
+        The figures of each frame; `spt_jax.config.processes` says how many others share the work.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`, and ValueError for a frame in which

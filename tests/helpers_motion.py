@@ -23,14 +23,16 @@ def tongs(apart=APART, dtype="float32"):
     arms = [arm.copy().apply_transform(up).apply_translation(p + half) for p in pivots[1:]]
     parts = [trunk, *arms]
     owner = np.repeat(np.arange(3), [len(part.vertices) for part in parts])
-    whole = trimesh.util.concatenate(parts)
+    start = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + k for part, k in zip(parts, start, strict=True)])
     return BodyModel(
-        template=jnp.asarray(whole.vertices, dtype),
-        shape_basis=jnp.zeros((len(whole.vertices), 3, 1), dtype),
+        template=jnp.asarray(vertices, dtype),
+        shape_basis=jnp.zeros((len(vertices), 3, 1), dtype),
         joint_template=jnp.asarray(pivots, dtype),
         joint_shape_basis=jnp.zeros((3, 3, 1), dtype),
         weights=jnp.asarray(np.eye(3)[owner], dtype),
-        faces=jnp.asarray(whole.faces, jnp.int32),
+        faces=jnp.asarray(faces, jnp.int32),
         parents=(-1, 0, 0),
         joint_names=("trunk", "left_ankle", "right_wrist"),
     )

@@ -162,6 +162,7 @@ NAMESPACES = {
         "write_mesh",
         "write_poses",
     ],
+    "metrics": ["MotionOverlap", "motion_overlap", "rejected"],
     "xla": ["Xla", "device_usage"],
 }
 

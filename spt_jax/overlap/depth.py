@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 # Triangles whose distance is worked out for each vertex before the bound that it gives is used.
 _FIRST = 8
@@ -58,7 +58,7 @@ def _nearest(points: Float[np.ndarray, "N 3"], triangles: Float[np.ndarray, "M 3
     """From each point to the nearest triangle: how far, and which."""
     center = triangles.mean(axis=1)
     radius = float(np.linalg.norm(triangles - center[:, None], axis=2).max())
-    tree = cKDTree(center)
+    tree = KDTree(center)
     first = tree.query(points, k=min(_FIRST, len(center)))[1].reshape(len(points), -1)
     bound = np.min([_to_triangles(points, triangles[column]) for column in first.T], axis=0)
     # A triangle that is nearer has its center within the bound and its own radius.

@@ -146,7 +146,7 @@ def posed(body, frames: Frames) -> Float[Array, "T V 3"]:
 
 @eqx.filter_jit
 def _turned(frames: Frames, turn):
-    return corrected(frames.pose, turn)
+    return corrected(jnp.asarray(frames.pose), turn)
 
 
 @eqx.filter_jit

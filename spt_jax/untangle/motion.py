@@ -141,13 +141,15 @@ def untangle_motion(
     Returns:
         The poses with the fewest frames that collide of those measured in each window, never more
         than in the motion given, and figures of each frame. Long runs of collisions are freed in
-        windows that overlap, one after the other.
+        windows that overlap, one after the other. Frames are measured eight at a time:
+        `spt_jax.config.processes = "auto"` shares them among the cores.
 
     Raises:
         ValueError: poses that are not (frames, J, 3), or not finite (the first such frame is
-            named); shape or translation that is not finite or does not fit; a rate, fade, margin,
-            fold_distance, weight of feet or direction that is not positive and finite where it has
-            to be; a frame in which the body has no surface that could be measured.
+            named); shape or translation that is not finite or does not fit; a rate or fade that
+            is not positive and finite; a margin, fold_distance or weight of feet that is negative
+            or not finite; no direction up; a frame in which the body has no surface that could be
+            measured.
         TypeError: poses traced; options that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
@@ -208,7 +210,8 @@ def untangle_motion(
 
 
 def _status(free: Bool[Array, ""]) -> Any:
-    return RESULTS.where(free, RESULTS.successful, RESULTS.intersections_left)
+    found: Any = RESULTS.successful
+    return RESULTS.where(free, found, RESULTS.intersections_left)
 
 
 def _after(body, frames: Frames, pose, moved, before: MotionOverlap, exclusions) -> MotionOverlap:
