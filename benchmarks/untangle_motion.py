@@ -180,7 +180,7 @@ def _smoothed(given, pose, sigma: float) -> np.ndarray:
         turn[:, joint - 1] = (first.inv() * second).as_rotvec()
     smooth = gaussian_filter1d(turn, sigma, axis=0, mode="nearest")
     found = np.asarray(corrected(jnp.asarray(given), jnp.asarray(smooth)))
-    return np.where(smooth.any(axis=(1, 2))[:, None, None], found, given)
+    return np.where(np.any(smooth != 0, axis=(1, 2), keepdims=True), found, given)
 
 
 def _frames(pose) -> Frames:
@@ -329,7 +329,7 @@ def _text(command: str, parts: list[Table]) -> str:
             "Default settings. Second differences are those of the skin's vertices from frame to "
             "frame; the recordings have no place of the root, so feet stand where they are within "
             f"5 cm of the lowest vertex. Smoothed: a Gaussian of {SMOOTHED:g} s over the turns "
-            "that freed each frame. Times are of processor cores, after compiling, a motion a core.",
+            "that freed each frame. Times are of one core a motion, after compiling.",
             *(table.markdown() for table in parts),
         ]
     )
