@@ -116,7 +116,7 @@ def _balls():
 
 
 class Calls:
-    """What can be asked for: of each, the mesh before, if any, the mesh, and the call."""
+    """What can be asked for: of each, the meshes before, if any, the mesh, and the call."""
 
     def __init__(self, world: World):
         self.world = world
@@ -135,21 +135,23 @@ class Calls:
             "rays512": (self._cold, _penalty(one, rays=512, directions=1)),
             "rays512x3": (self._cold, _penalty(one, rays=512)),
             "rays2048": (self._cold, _penalty(one, rays=2048, directions=1)),
-            "scene": (lambda k: (None, world.scene(k, 2, 0.45)), _penalty(two)),
-            "five": (lambda k: (None, world.scene(k, 5, 2.5)), _penalty(five)),
+            "scene": (lambda k: ((), world.scene(k, 2, 0.45)), _penalty(two)),
+            "five": (lambda k: ((), world.scene(k, 5, 2.5)), _penalty(five)),
             "box": (self._boxes, _penalty(box)),
         }
         self._classify = jax.jit(functools.partial(_labels, one.array))
 
     def _cold(self, k: int):
-        return None, self.world.vertices[k]
+        return (), self.world.vertices[k]
 
     def _warm(self, k: int):
-        return self.world.vertices[k], self.world.near(k)
+        # The third call of a search, each a step from the last.
+        now, after = self.world.vertices[k], self.world.near(k)
+        return (2 * now - after, now), after
 
     def _boxes(self, k: int):
         size = jnp.array([1.0 + 0.01 * k, 1.0, 1.0], jnp.float32)
-        return None, jnp.asarray(self.world.box.vertices, jnp.float32) * size
+        return (), jnp.asarray(self.world.box.vertices, jnp.float32) * size
 
     def prepared(self, name: str, k: int):
         """What is to be timed: a call without arguments."""
@@ -173,8 +175,8 @@ class Calls:
         else:
             meshes, call = self.kinds[name]
             before, vertices = meshes(k % _FRAMES)
-            if before is not None:
-                jax.block_until_ready(call(jax.block_until_ready(before)))
+            for mesh in before:
+                jax.block_until_ready(call(jax.block_until_ready(mesh)))
         vertices = jax.block_until_ready(vertices)
         return lambda: call(vertices)
 
