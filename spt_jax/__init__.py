@@ -3,7 +3,7 @@
 import importlib.metadata
 import typing
 
-from spt_jax.lazy import lazy_names
+from spt_jax.lazy import lazy_names as _lazy_names
 
 if typing.TYPE_CHECKING:
     from spt_jax import fit as fit
@@ -104,7 +104,7 @@ __all__ = [
 
 # Imported when they are first asked for: who only calls the penalty does not wait for optimistix,
 # and `spt_jax.overlap`, NumPy and SciPy alone, can be imported without JAX.
-__getattr__, __dir__ = lazy_names(
+__getattr__, __dir__ = _lazy_names(
     __name__,
     {
         "BodyModel": "spt_jax.body",

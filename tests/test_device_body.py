@@ -12,6 +12,7 @@ FACES = body_faces().astype(np.int32)
 RAYS = 128
 
 
+@pytest.mark.slow
 def test_poses_as_on_the_host():
     """A batch of two in single precision; a part of a ray or two may meet the next triangle."""
     bodies = posed_bodies(["crawl/0092", "run/0010"]).astype(np.float32)

@@ -67,6 +67,7 @@ def test_what_is_near_depends_on_where(rng):
         np.testing.assert_array_equal(same, folds.near(f, g))
 
 
+@pytest.mark.slow
 def test_fingers_are_near_exactly(rng):
     """Where seeds are farther away than folds reach; between two bodies nothing is near."""
     body = embedded_body()

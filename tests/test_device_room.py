@@ -33,6 +33,7 @@ def short_of(name):
     return need, {key for key in Xla._fields[:3] if getattr(need, key) > getattr(have, key)}
 
 
+@pytest.mark.slow
 def test_small_arrays_take_more_strips_and_change_nothing():
     mesh = padded("box in a box", "float32")
     value, gradient = value_and_gradient(*mesh)

@@ -276,6 +276,7 @@ def test_hessians_of_functions_of_the_penalty_keep_their_own_curvature(x64, in_j
     np.testing.assert_allclose(batch[1], expected, rtol=2e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["numpy", "xla"])
 def test_forward_mode_says_what_to_take(backend):
     vertices = as_jax(PAIR, "float32")

@@ -101,7 +101,6 @@ def test_names():
         for name in dir(spt_jax)
         if not name.startswith("_") and not inspect.ismodule(getattr(spt_jax, name))
     ]
-    public.remove("lazy_names")
     assert sorted(public) == NAMES
     assert sorted(spt_jax.__all__) == sorted([*NAMES, "__version__"])
     with pytest.raises(AttributeError, match="no attribute 'fit_pse'"):

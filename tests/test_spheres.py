@@ -118,6 +118,7 @@ def test_what_the_shape_alone_brings_together_costs_nothing_at_rest(dtype):
     assert sphere_penalty(spheres, body, bent(dtype, 0.5), fat) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_capsule_is_filled_as_its_formula_says(x64):
     body = capsule()
     spheres = BodySpheres.fit(body)
@@ -153,6 +154,7 @@ def test_spheres_follow_the_shape(x64):
     assert (grow[:, 2] > 0.4 * radii).all()
 
 
+@pytest.mark.slow
 def test_the_embedded_body_is_filled(spheres):
     body = embedded_body()
     covered, outside = spheres.coverage(body)

@@ -61,6 +61,7 @@ def test_a_pose_without_overlap_comes_back_to_the_bit():
     assert result.is_free and result.reason == "collision-free"
 
 
+@pytest.mark.slow
 def test_shape_and_translation_are_used_and_kept(x64):
     body = embedded_body()
     pose = frame("punch/0024", "float64")

@@ -2,7 +2,7 @@
 
 import typing
 
-from spt_jax.lazy import lazy_names
+from spt_jax.lazy import lazy_names as _lazy_names
 
 if typing.TYPE_CHECKING:
     from spt_jax.fit.figure import Variables as Variables
@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 # Imported when they are first asked for: they bring optimistix, and import this package.
-__getattr__, __dir__ = lazy_names(
+__getattr__, __dir__ = _lazy_names(
     __name__,
     {
         "BodySpheres": "spt_jax.fit.terms.spheres",
