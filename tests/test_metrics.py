@@ -43,7 +43,11 @@ def test_depth_against_distances_to_every_triangle(rng):
     first = trimesh.creation.icosphere(subdivisions=2)
     second = first.copy().apply_scale([0.4, 1.3, 0.5]).apply_translation([0.9, 0.1, 0.2])
     vertices, faces = joined(*((np.array(m.vertices), np.array(m.faces)) for m in (first, second)))
-    inside = np.concatenate([second.contains(first.vertices), first.contains(second.vertices)])
+    winding = [
+        igl.winding_number(np.array(mesh.vertices), np.array(mesh.faces), np.array(other.vertices))
+        for mesh, other in ((second, first), (first, second))
+    ]
+    inside = np.concatenate(winding) > 0.5
     depth, nearest = penetration_depths(vertices, faces, inside)
     assert inside.sum() > 20 and not depth[~inside].any() and (nearest[~inside] == -1).all()
     split = len(first.vertices)
