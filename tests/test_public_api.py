@@ -73,7 +73,7 @@ PARAMETERS = {
     "load_body": "source='anny', *, num_shape=10, dtype=None, max_bytes=None",
     "load_mocap": "",
     "untangle_motion": "body, poses, *, shape=None, translation=None, frames_per_second=30.0,"
-    " fade=0.1, fold_distance=None, margin=0.002, feet=1.0, up=(0.0, 1.0, 0.0), tolerance=1e-09,"
+    " fade=0.05, fold_distance=None, margin=0.002, feet=1.0, up=(0.0, 1.0, 0.0), tolerance=1e-09,"
     " on_step=None",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"

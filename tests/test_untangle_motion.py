@@ -50,7 +50,7 @@ def test_frames_far_from_a_collision_are_those_given_to_the_bit():
     result = untangle_motion(body, pose)
     hit = np.flatnonzero(~result.before.is_free)
     far = np.ones(len(pose), bool)
-    far[hit.min() - 15 : hit.max() + 16] = False  # five times 0.1 s at 30 frames a second
+    far[hit.min() - 15 : hit.max() + 16] = False  # five times 0.05 s are fewer
     assert far.sum() > 50 and not result.moved[far].any() and result.moved[hit].all()
     np.testing.assert_array_equal(np.asarray(result.pose)[far], pose[far])
     still = untangle_motion(body, pose[: hit.min()])

@@ -96,7 +96,7 @@ def untangle_motion(
     shape: Float[Array, "*T B"] | Float[np.ndarray, "*T B"] | None = None,
     translation: Float[Array, "*T 3"] | Float[np.ndarray, "*T 3"] | None = None,
     frames_per_second: float = 30.0,
-    fade: float = 0.1,
+    fade: float = 0.05,
     fold_distance: float | None = None,
     margin: float = 0.002,
     feet: float = 1.0,

@@ -15,7 +15,7 @@ from spt_jax.untangle.frame_cuts import FrameCuts, Prior
 # slide along the contact rather than jump out of it, and more from round to round in frames that
 # still collide; then the margin grows.
 _ROUNDS = 24
-_FIRST, _MORE, _LAST = 0.03, 4.0, 200.0
+_FIRST, _MORE, _LAST = 0.02, 3.0, 200.0
 _WIDER, _WIDEST = 1.5, 4.0
 
 # Rounds after which it is first looked whether frames are free.
