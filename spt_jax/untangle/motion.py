@@ -160,7 +160,7 @@ def untangle_motion(
         >>> frame = mocap.names.index("cartwheel/0102")
         >>> result = untangle_motion(body, body.pose_from_smpl(mocap.pose[frame : frame + 3]))
         >>> int(result.before.is_free.sum()), int(result.after.is_free.sum())
-        (0, 3)
+        (1, 3)
     """
     frames = _as_frames(body, poses, shape, translation)
     rate = _as_positive("frames_per_second", frames_per_second)
