@@ -7,16 +7,7 @@ from jaxtyping import Array, Float, Integer
 
 from spt_jax.arguments import as_mesh
 from spt_jax.bounded_jit import BoundedJit
-
-# A vertex moves at most this many distances. A box's corner needs 1.73, a cone of 39 degrees at its
-# tip needs 3; the needles beyond would shoot far out of the mesh and into its other parts.
-FARTHEST = 3.0
-
-# How sharply the triangle that a vertex has to move farthest for is told from the others. The
-# largest of several numbers has no derivative where they are equal, as at every vertex of a flat or
-# box-shaped side; the logarithm of a mean of exponentials has. It falls short of the largest by
-# log(1 / share) / 8192 at most: 0.04 % where that triangle has a twentieth of the angle.
-_SHARPNESS = 8192.0
+from spt_jax.overlap.inflation import FARTHEST, SHARPNESS
 
 
 def inflate(
@@ -79,12 +70,12 @@ def _inflate(_, vertices, faces, distance):
     nothing = jnp.zeros_like(finite[..., 0])
     largest = jax.lax.stop_gradient(nothing.at[..., corner].max(needed))
     weight = angle.reshape(*vertices.shape[:-2], -1)
-    above = jnp.exp(_SHARPNESS * (needed - largest[..., corner])) * weight
+    above = jnp.exp(SHARPNESS * (needed - largest[..., corner])) * weight
     total = nothing.at[..., corner].add(weight)
     mean = nothing.at[..., corner].add(above)
     solid = (mean > 0) & (total > 0)
     mean = jnp.where(solid, mean, 1.0) / jnp.where(solid, total, 1.0)
-    mitre = jnp.where(solid, largest + jnp.log(mean) / _SHARPNESS, 1.0)
+    mitre = jnp.where(solid, largest + jnp.log(mean) / SHARPNESS, 1.0)
     return vertices + distance * mitre[..., None] * direction
 
 

@@ -78,14 +78,14 @@ def test_shape_and_translation_are_used_and_kept(x64):
 def test_the_best_pose_seen_is_kept(monkeypatch):
     """A second weight that undoes the first one: the pose after the first comes back."""
     pose = frame("punch/0024")
-    descend = untangle._descend
+    descend = untangle.descend
 
     def undoing(search, body, fixed, moved, margin, weight):
         if weight > 1.0:
             return -3.0 * moved, search.steps_per_weight, RESULTS.successful
         return descend(search, body, fixed, moved, margin, weight)
 
-    monkeypatch.setattr(untangle, "_descend", undoing)
+    monkeypatch.setattr(untangle, "descend", undoing)
     options = {"folds": "count", "rays": 64, "steps_per_weight": 10}
     first = untangle_pose(embedded_body(), pose, weights=(1.0,), **options)
     both = untangle_pose(embedded_body(), pose, weights=(1.0, 2.0), **options)
@@ -215,7 +215,7 @@ def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, ray
 @pytest.mark.slow
 def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
     """Every second descent ends nowhere, in a full turn and more, or at numbers that are none."""
-    descend, calls = untangle._descend, []
+    descend, calls = untangle.descend, []
 
     def sometimes(search, body, fixed, moved, margin, weight):
         calls.append(np.array(moved))
@@ -223,7 +223,7 @@ def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
         lost = jnp.full_like(found, jnp.nan) if len(calls) % 4 else 1e6 * jnp.ones_like(found)
         return (lost if len(calls) % 2 else found), steps, ended
 
-    monkeypatch.setattr(untangle, "_descend", sometimes)
+    monkeypatch.setattr(untangle, "descend", sometimes)
     result = untangle_pose(boxes(), swung(2.6, dtype), weights=(0.1, 1.0, 10.0, 100.0, 1000.0))
     assert result.is_free and result.after.volume == 0 and result.pose.dtype == dtype
     assert all(np.isfinite(moved).all() for moved in calls) and len(calls) >= 2
@@ -231,13 +231,13 @@ def test_the_search_goes_on_where_it_last_could_be_measured(monkeypatch, dtype):
 
 @pytest.mark.slow
 def test_each_pose_of_a_batch_says_how_it_ended(monkeypatch):
-    descend = untangle._descend
+    descend = untangle.descend
 
     def fails_for_some(search, body, fixed, *rest):
         found, steps, ended = descend(search, body, fixed, *rest)
         return (found * jnp.nan if fixed[0][1, 1] > 2.7 else found), steps, ended
 
-    monkeypatch.setattr(untangle, "_descend", fails_for_some)
+    monkeypatch.setattr(untangle, "descend", fails_for_some)
     poses = jnp.stack([swung(angle) for angle in (0.3, 2.6, 2.8)])
     result = untangle_pose(boxes(), poses)
     assert result.is_free.tolist() == [True, True, False]

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from spt_jax.overlap.triangles.faces_cache import FacesCache
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.triangles.pair_planes import ROUNDING
+from spt_jax.overlap.vectors import cross, dot
 
 # Beyond, the search is hardly slower than all vertices against all planes.
 _MOST_FACES = 256
@@ -64,14 +65,13 @@ def is_small_convex_solid(
         return False
     points /= size
     a, b, c = points[shape.corners]
-    u, v = b - a, c - a
-    normal = u[:, [1, 2, 0]] * v[:, [2, 0, 1]] - u[:, [2, 0, 1]] * v[:, [1, 2, 0]]
-    length = np.sqrt((normal * normal).sum(axis=1))
+    normal = cross(b - a, c - a)
+    length = np.sqrt(dot(normal, normal))
     # A plane is known where its triangle is not a line, to far more digits than are compared.
     if not length.min() > np.sqrt(rounding):
         return False
     normal /= length[:, None]
-    offset = (normal * a).sum(axis=1)
+    offset = dot(normal, a)
     # Seen from the middle: all planes are farther out than rounding could put them.
     if not offset.min() > np.sqrt(rounding):
         return False
@@ -82,12 +82,9 @@ def is_small_convex_solid(
 
 def _turns(a, b, c) -> float:
     """How often triangles go round the origin (van Oosterom and Strackee 1983)."""
-    (p, q, r), ab, bc, ca = (
-        (np.sqrt((x * x).sum(axis=1)) for x in (a, b, c)),
-        (a * b).sum(axis=1),
-        (b * c).sum(axis=1),
-        (c * a).sum(axis=1),
+    p, q, r = (np.sqrt(dot(x, x)) for x in (a, b, c))
+    solid = dot(a, cross(b, c))
+    return float(
+        np.arctan2(solid, p * q * r + dot(a, b) * r + dot(b, c) * p + dot(c, a) * q).sum()
+        / (2 * np.pi)
     )
-    normal = b[:, [1, 2, 0]] * c[:, [2, 0, 1]] - b[:, [2, 0, 1]] * c[:, [1, 2, 0]]
-    solid = (a * normal).sum(axis=1)
-    return float(np.arctan2(solid, p * q * r + ab * r + bc * p + ca * q).sum() / (2 * np.pi))

@@ -100,6 +100,7 @@ class ContactSolver(optx.AbstractMinimiser):
         slope, height = _with_cut(state, at, value, gradient, usable)
         place, promised = _model_minimum(slope, height, best, jnp.where(first, 0.0, held))
         gain = least - promised
+        aux = jax.tree.map(lambda new, old: jnp.where(better, new, old), aux, state.aux)
         return (
             best,
             _State(
@@ -110,9 +111,9 @@ class ContactSolver(optx.AbstractMinimiser):
                 steps=state.steps + 1,
                 held=jnp.where(first, 0.0, held),
                 done=~(gain > self.rtol * least + self.atol),
-                aux=jax.tree.map(lambda new, old: jnp.where(better, new, old), aux, state.aux),
+                aux=aux,
             ),
-            jax.tree.map(lambda new, old: jnp.where(better, new, old), aux, state.aux),
+            aux,
         )
 
     def terminate(self, fn, y, args, options, state: _State, tags):

@@ -14,18 +14,13 @@ from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angl
 from spt_jax.geometry import inflate
 from spt_jax.penalty import self_intersection_penalty
 from spt_jax.rest_surface import RestSurface
-
-# Added to the mean squared vertex displacement per squared radian of every joint axis, in m^2, as
-# for single poses.
-_STIFFNESS = 1e-3
+from spt_jax.untangle.descent import CENTIMETRE, STIFFNESS
 
 # Vertices and frames by which a window's displacements are weighed.
 _SAMPLED_VERTICES, _SAMPLED_FRAMES = 1500, 6
 
 # Frames that one compiled call measures, so that each processor has some.
 BATCH = 8
-
-_CENTIMETRE = 0.01
 
 
 class Frames(NamedTuple):
@@ -135,7 +130,7 @@ def displacement_factor(
         jnp.asarray(standing[chosen], dtype),
     )
     form = np.asarray(forms, np.float64).mean(axis=0)
-    return np.linalg.cholesky(form + _STIFFNESS * np.eye(len(form)))
+    return np.linalg.cholesky(form + STIFFNESS * np.eye(len(form)))
 
 
 @eqx.filter_jit
@@ -155,7 +150,7 @@ def _overlaps(body, rest: RestSurface | None, frames: Frames, turn, margin):
         vertices = body(corrected(pose, turn), shape, translation).vertices
         outer = inflate(vertices, body.faces, margin / 2)
         volume = self_intersection_penalty(outer, body.faces, rest_surface=rest)
-        return volume / _CENTIMETRE**3
+        return volume / CENTIMETRE**3
 
     return jax.vmap(jax.value_and_grad(overlap))(turn, *frames, margin)
 
@@ -173,12 +168,12 @@ class Corrections(NamedTuple):
 
     def turns(self, vectors: Float[np.ndarray, "T N"]) -> Float[np.ndarray, "T K 3"]:
         """Turns of the joints, in radians."""
-        turn = np.linalg.solve(self.factor.T, _CENTIMETRE * vectors.T).T
+        turn = np.linalg.solve(self.factor.T, CENTIMETRE * vectors.T).T
         return turn.reshape(len(vectors), -1, 3)
 
     def vectors(self, turns: Float[np.ndarray, "T K 3"]) -> Float[np.ndarray, "T N"]:
         """The vectors of turns."""
-        return turns.reshape(-1, len(self.factor)) @ self.factor / _CENTIMETRE
+        return turns.reshape(-1, len(self.factor)) @ self.factor / CENTIMETRE
 
     def overlaps(
         self,
@@ -210,7 +205,7 @@ class Corrections(NamedTuple):
             gradients.append(np.asarray(gradient, np.float64).reshape(BATCH, -1))
         value = np.concatenate(values)[: len(chosen)]
         by_turn = np.concatenate(gradients)[: len(chosen)]
-        return value, _CENTIMETRE * np.linalg.solve(self.factor, by_turn.T).T
+        return value, CENTIMETRE * np.linalg.solve(self.factor, by_turn.T).T
 
     def poses(
         self, chosen: Int[np.ndarray, "F"], vectors: Float[np.ndarray, "F N"]

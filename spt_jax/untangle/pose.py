@@ -1,9 +1,7 @@
 """Remove a posed body's self-intersections by moving its joints."""
 
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,19 +12,24 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
 from spt_jax.exclusions import as_fold_surface
-from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
+from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable
 from spt_jax.overlap.rays.beam import Rays
-from spt_jax.penalty import self_intersection_penalty
-from spt_jax.rest_surface import RestSurface
 from spt_jax.result import Overlap, Result, plain
 from spt_jax.status import RESULTS, in_words, names_of
-from spt_jax.untangle.contact_solver import ContactSolver
+from spt_jax.untangle.descent import (
+    SOLVER,
+    Folds,
+    Search,
+    descend,
+    descend_in_steps,
+    displacement_factor,
+    faces_of,
+    turned,
+    vertices_of,
+)
 from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.spread import Surface
-from spt_jax.untangle.steps import OnStep, Step
-
-Folds = Literal["ignore", "remove", "count"]
+from spt_jax.untangle.steps import OnStep
 
 # Per cubic centimetre, against squared centimetres of displacement. The first is weak enough that
 # the pose slides along the contact rather than jumping out of it; the last leaves about a
@@ -34,18 +37,6 @@ Folds = Literal["ignore", "remove", "count"]
 _WEIGHTS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 # Below this a weight may be too weak to move anything.
 _STRONG = 10.0
-
-# Added to the mean squared vertex displacement per squared radian of every joint axis, in m^2.
-# Without it the fingers, which move few vertices, may turn through any angle for next to nothing.
-# Over six poses 1e-3 gave smaller displacements than 1e-4 at the same overlap (57 against 77 mm).
-_STIFFNESS = 1e-3
-
-_CENTIMETRE = 0.01
-
-# What is tried where the weights left collisions: the margin, times this, with the last weights
-# again from where the last attempt ended.
-_WIDER = (2.0, 4.0)
-_AGAIN = 3
 
 # A pose that turns a joint by more than a full turn, in radians, is no pose near the one given.
 _MOST_TURN = 2 * np.pi
@@ -142,7 +133,7 @@ def untangle_pose(
         tolerance: an overlap of this volume or less, in m^3, counts as none where no faces
             intersect; the default is 1 mm^3.
         solver: an optimistix minimiser; by default `contact_solver.ContactSolver`, which asks for
-            the overlap nine times where `optimistix.BFGS` does fifty times.
+            the overlap a quarter as often as `optimistix.BFGS` (benchmarks/results.md).
         on_step: called with a `spt_jax.Step` after each step of the solver; what it raises ends the
             search. The solver's loop then runs in Python.
 
@@ -205,7 +196,7 @@ def untangle_pose(
             raise ValueError(f"{name} must be finite: got {np.asarray(array)!r}.")
     way = as_choice("folds", folds, Folds)
     rest = None if way == "count" else as_fold_surface(body, fold_distance)
-    search = _Search(
+    search = Search(
         rays=_as_search_rays(rays),
         directions=as_directions(directions),
         folds=way,
@@ -229,58 +220,6 @@ def untangle_pose(
     return jax.tree.map(lambda *leaves: jnp.stack(leaves).reshape(*batch, *leaves[0].shape), *found)
 
 
-class _Search(eqx.Module):
-    """What stays the same for all poses; static, so that the solver is compiled once."""
-
-    rays: Rays = eqx.field(static=True)
-    directions: tuple = eqx.field(static=True)
-    folds: Folds = eqx.field(static=True)
-    margin: float = eqx.field(static=True)
-    weights: tuple[float, ...] = eqx.field(static=True)
-    steps_per_weight: int = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
-    rest: RestSurface | None = eqx.field(static=True)
-    solver: optx.AbstractMinimiser
-
-    @property
-    def measured_rays(self) -> Rays:
-        """What is compared and reported is measured with."""
-        return 2 * self.rays if isinstance(self.rays, int) else None
-
-    def measure(
-        self, vertices: Float[Array | np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-    ) -> Measurement:
-        """The overlap of a posed body, of which no more is worked out than is asked for.
-
-        Raises:
-            Unmeasurable: there is none that could be measured.
-        """
-        return measure(
-            np.asarray(vertices, np.float64),
-            faces,
-            Sampling(self.measured_rays, self.directions),
-            Exclusions(rest=self.rest),
-            float(jnp.finfo(vertices.dtype).eps),
-        )
-
-    def rank(self, found: Measurement) -> tuple[int, float]:
-        """Sorts overlaps, the best first."""
-        return (0 if self.folds == "count" else found.intersecting_pairs), found.volume
-
-    def is_free(self, found: Measurement) -> bool:
-        """Whether there is nothing left to do."""
-        pairs, volume = self.rank(found)
-        return pairs == 0 and volume <= self.tolerance
-
-    def attempts(self) -> list[tuple[float, float]]:
-        """Margin and weight of every descent."""
-        if self.folds == "count":
-            return [(0.0, weight) for weight in self.weights]
-        wider = _WIDER if self.margin else ()
-        again = [(self.margin * more, w) for more in wider for w in self.weights[-_AGAIN:]]
-        return [(self.margin, weight) for weight in self.weights] + again
-
-
 def _as_search_rays(rays: Any) -> Rays:
     search_rays = as_rays(rays)
     if isinstance(search_rays, tuple) or (
@@ -294,7 +233,7 @@ def _as_search_rays(rays: Any) -> Rays:
 
 
 def _untangle_one(
-    search: _Search,
+    search: Search,
     surface: Surface | None,
     body: BodyModel,
     pose: Array,
@@ -302,12 +241,12 @@ def _untangle_one(
     translation: Array | None,
     on_step: OnStep | None,
 ) -> UntangleResult:
-    vertices, faces = _posed(body, pose, shape, translation), _faces_of(body)
+    vertices, faces = vertices_of(body, pose, shape, translation), faces_of(body)
     before = search.measure(vertices, faces)
     best, after, steps = pose, before, 0
     ended, diverged = RESULTS.successful, False
     if not search.is_free(before):
-        factor = _displacement_factor(body, pose, shape)
+        factor = displacement_factor(body, pose, shape)
         moved = jnp.zeros(factor.shape[:1], pose.dtype)
         idle = 0
         for stage, (margin, weight) in enumerate(search.attempts()):
@@ -320,9 +259,9 @@ def _untangle_one(
                 jnp.asarray(weight, pose.dtype),
             )
             if on_step is None:
-                there, taken, ended = _descend(*arguments)
+                there, taken, ended = descend(*arguments)
             else:
-                there, taken, ended = _descend_in_steps(*arguments, stage, steps, on_step)
+                there, taken, ended = descend_in_steps(*arguments, stage, steps, on_step)
             steps += int(taken)
             candidate = turned(pose, factor, there)
             found = _measured(search, body, pose, candidate, shape, translation)
@@ -356,13 +295,13 @@ def _untangle_one(
     )
 
 
-def _measured(search: _Search, body, pose, candidate, shape, translation):
+def _measured(search: Search, body, pose, candidate, shape, translation):
     """The vertices and the overlap of a pose, or None where it has run away."""
     if not float(jnp.max(jnp.linalg.norm(candidate - pose, axis=-1))) <= _MOST_TURN:  # NaN is not
         return None
-    posed = _posed(body, candidate, shape, translation)
+    posed = vertices_of(body, candidate, shape, translation)
     try:
-        return posed, search.measure(posed, _faces_of(body))
+        return posed, search.measure(posed, faces_of(body))
     except Unmeasurable:
         return None
 
@@ -377,15 +316,6 @@ def _overlap(found: Measurement, dtype: Any) -> Overlap:
     )
 
 
-@eqx.filter_jit
-def _posed(body, pose, shape, translation):
-    return body(pose, shape, translation).vertices
-
-
-def _faces_of(body: BodyModel) -> Int[np.ndarray, "F 3"]:
-    return np.asarray(body.faces, np.int64)
-
-
 def _status(free: bool, diverged: bool, ended: Any) -> Any:
     if free:
         return RESULTS.successful
@@ -394,121 +324,6 @@ def _status(free: bool, diverged: bool, ended: Any) -> Any:
     if ended == RESULTS.successful:
         return RESULTS.intersections_left
     return ended
-
-
-@eqx.filter_jit
-def _displacement_factor(body, pose, shape):
-    """Cholesky factor of the quadratic form: joint rotations -> mean squared displacement."""
-    jacobian = jax.jacfwd(lambda joints: body(pose.at[1:].set(joints), shape).vertices)(pose[1:])
-    jacobian = jacobian.reshape(-1, pose[1:].size)
-    form = jacobian.T @ jacobian / body.num_vertices
-    return jnp.linalg.cholesky(form + _STIFFNESS * jnp.eye(len(form), dtype=form.dtype))
-
-
-def turned(pose, factor, moved):
-    """The pose whose linearised displacement, in centimetres, has the squared norm of `moved`."""
-    turn = jax.scipy.linalg.solve_triangular(factor, moved, trans=1, lower=True)
-    return pose.at[1:].add(_CENTIMETRE * turn.reshape(pose[1:].shape))
-
-
-def _objective(search: _Search, moved, arguments):
-    body, (pose, shape, translation, factor), margin, weight = arguments
-    vertices = body(turned(pose, factor, moved), shape, translation).vertices
-    volume = self_intersection_penalty(
-        vertices,
-        body.faces,
-        rays=search.rays,
-        directions=np.array(search.directions),
-        margin=margin,
-        rest_surface=search.rest,
-    )
-    return jnp.sum(moved**2) + weight * volume / _CENTIMETRE**3
-
-
-@eqx.filter_jit
-def _descend(search: _Search, body, fixed, moved, margin, weight):
-    solution = optx.minimise(
-        partial(_objective, search),
-        search.solver,
-        moved,
-        (body, fixed, margin, weight),
-        max_steps=search.steps_per_weight,
-        throw=False,
-    )
-    return solution.value, solution.stats["num_steps"], RESULTS.promote(solution.result)
-
-
-def _descend_in_steps(
-    search: _Search, body, fixed, moved, margin, weight, stage: int, steps: int, on_step: OnStep
-):
-    """`_descend` with the solver's loop in Python, so that each step can be looked at.
-
-    The loop is that of https://docs.kidger.site/optimistix/examples/interactive-solves/.
-    """
-    arguments = (body, fixed, margin, weight)
-    state = _first_state(search, arguments, moved)
-    done, result = _terminated(search, arguments, moved, state)
-    taken = 0
-    while not done and taken < search.steps_per_weight:
-        moved, state, done, result, pose, vertices = _one_step(search, arguments, moved, state)
-        taken += 1
-        vertices, faces = np.asarray(vertices), _faces_of(body)
-        on_step(
-            Step(
-                stage,
-                steps + taken,
-                vertices,
-                np.asarray(pose),
-                partial(_volume_and_pairs, search, vertices, faces),
-            )
-        )
-    if not done:
-        result = RESULTS.nonlinear_max_steps_reached
-    return moved, taken, RESULTS.promote(result) if done else result
-
-
-def _volume_and_pairs(search: _Search, vertices, faces) -> tuple[float, int]:
-    try:
-        overlap = search.measure(vertices, faces)
-    except Unmeasurable:
-        return float("nan"), -1
-    return overlap.volume, overlap.intersecting_pairs
-
-
-def _with_aux(search: _Search, moved, arguments):
-    return _objective(search, moved, arguments), None
-
-
-def _solving(search: _Search, arguments) -> dict[str, Any]:
-    return {
-        "fn": partial(_with_aux, search),
-        "args": arguments,
-        "options": {},
-        "tags": frozenset(),
-    }
-
-
-@eqx.filter_jit
-def _first_state(search: _Search, arguments, moved):
-    shape = jax.ShapeDtypeStruct((), moved.dtype)
-    return search.solver.init(
-        y=moved, f_struct=shape, aux_struct=None, **_solving(search, arguments)
-    )
-
-
-@eqx.filter_jit
-def _terminated(search: _Search, arguments, moved, state):
-    return search.solver.terminate(y=moved, state=state, **_solving(search, arguments))
-
-
-@eqx.filter_jit
-def _one_step(search: _Search, arguments, moved, state):
-    solving = _solving(search, arguments)
-    moved, state, _ = search.solver.step(y=moved, state=state, **solving)
-    done, result = search.solver.terminate(y=moved, state=state, **solving)
-    body, (pose, shape, translation, factor), _, _ = arguments
-    at = turned(pose, factor, moved)
-    return moved, state, done, result, at, body(at, shape, translation).vertices
 
 
 def _per_pose(name, array, batch, count):
@@ -523,7 +338,3 @@ def _per_pose(name, array, batch, count):
             f"{array.shape}."
         ) from None
     return list(spread.reshape(count, array.shape[-1]))
-
-
-# One object, so that a search is compiled once.
-SOLVER = ContactSolver(rtol=0.03, atol=1e-6)
