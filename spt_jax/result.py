@@ -1,5 +1,6 @@
 """What results have in common: JSON, and how they print."""
 
+import abc
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
@@ -18,9 +19,9 @@ else:
 class Result(eqx.Module):
     """A result that `print` shows as a table and `as_dict` turns into JSON types."""
 
+    @abc.abstractmethod
     def as_dict(self) -> dict[str, Any]:
         """The numbers of the result as JSON types, without its large arrays."""
-        raise NotImplementedError
 
     def __str__(self) -> str:
         from rich.console import Console

@@ -11,6 +11,8 @@ import numpy as np
 import scipy
 from jaxtyping import Int
 
+from spt_jax.overlap.ranges import spread
+
 # Vertices to a block: of a posed body 20 to 60 blocks are cut.
 _SIZE = 32
 
@@ -52,9 +54,8 @@ class Blocks:
         single = np.flatnonzero(marked[self.block])
         node = self.block.copy()
         node[single] = self.count + np.arange(len(single))
-        first, length = self.start[found], self.start[found + 1] - self.start[found]
-        at = np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
-        rows = self.rows[at]
+        first = self.start[found]
+        rows = self.rows[spread(first, self.start[found + 1] - first)[0]]
         joins = np.ones(len(self.ends), bool)
         joins[cut] = False
         ends = self.ends[rows[joins[rows]]]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
+from spt_jax.overlap.ranges import spread
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 
 # Candidates handled at once: bounds the memory for any mesh. A posed body's pairs take 5.0 ms with
@@ -353,12 +354,6 @@ def cross(x, y):
         out[k] = x[i] * y[j]
         out[k] -= x[j] * y[i]
     return out
-
-
-def spread(first, count):
-    """first[i], first[i] + 1, ... (count[i] of them) for each i in turn; and the i of each."""
-    at = np.repeat(np.arange(len(count)), count)
-    return np.arange(len(at)) + (first - np.cumsum(count) + count).take(at), at
 
 
 def pieces(count: int, size: int) -> Iterator[slice]:

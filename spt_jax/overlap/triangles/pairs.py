@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from spt_jax.overlap.ranges import spread
 from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
 from spt_jax.overlap.triangles.pair_boxes import (
     Shape,
@@ -20,7 +21,6 @@ from spt_jax.overlap.triangles.pair_boxes import (
     near_groups,
     near_pairs,
     parts,
-    spread,
 )
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
 from spt_jax.overlap.triangles.pair_planes import ROUNDING, not_apart, straddles

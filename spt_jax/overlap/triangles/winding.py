@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.ranges import spread
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours
 from spt_jax.overlap.triangles.manifold import Manifold
-from spt_jax.overlap.triangles.pair_boxes import spread
 from spt_jax.overlap.triangles.pair_layout import Topology
 from spt_jax.overlap.triangles.pairs import EdgeCrossings
 from spt_jax.overlap.triangles.predicates import Predicates
