@@ -212,6 +212,7 @@ REFUSED = [
     ("x.pkl", saved(BODY | {"transl": np.zeros((5, 3))}), r"transl must have shape .*\(5, 3\)"),
     ("x.pkl", saved(BODY | {"fps": -1.0}), "fps must be one positive number"),
     ("x.pkl", saved({0: {"pose": np.full((1, 72), np.nan)}}), r"\[0\]\.pose must be finite"),
+    ("x.pkl", saved({k: {"pose": np.zeros((1, 72))} for k in (1, "1")}), "'1' more than once"),
     ("x.pkl", saved({0: {"pose": "abc"}}), r"\[0\]\.pose must hold numbers: got str"),
     ("x.pkl", saved(MADE["wham"]), "asks for helpers_poses.wham"),
     ("x.pkl", saved(BODY)[:-40], "must be a whole pickle"),

@@ -91,7 +91,8 @@ def motion_of(asked: Chosen, model: "BodyModel", body: str) -> tuple[Motion, lis
     """The frames asked for on the body, and what of them had to be left out."""
     notes = list(asked.file.notes)
     poses, lost = [], {}
-    for track, rows in _by_track(asked):
+    for k, rows in _rows(asked):
+        track = asked.tracks[k]
         pose = track.pose[rows]
         turned = np.any(pose, axis=(0, 2)).tolist()
         layout = SMPL_LAYOUTS[track.pose.shape[1]]
@@ -111,7 +112,8 @@ def motion_of(asked: Chosen, model: "BodyModel", body: str) -> tuple[Motion, lis
     if len(known) == len(shifts):
         translation = np.stack([known[k][row] for k, row in asked.rows]).astype(np.float32)
     order = [(k, row) for k, rows in _rows(asked) for row in rows]
-    pose = np.concatenate(poses)[[order.index(place) for place in asked.rows]]
+    at = {place: number for number, place in enumerate(order)}
+    pose = np.concatenate(poses)[[at[place] for place in asked.rows]]
     return Motion(asked.names, pose, shape, translation), notes
 
 
@@ -121,10 +123,6 @@ def _rows(asked: Chosen) -> list[tuple[int, list[int]]]:
     for k, row in asked.rows:
         found.setdefault(k, []).append(row)
     return sorted(found.items())
-
-
-def _by_track(asked: Chosen) -> list[tuple[Track, list[int]]]:
-    return [(asked.tracks[k], rows) for k, rows in _rows(asked)]
 
 
 def _shapes(asked: Chosen, model: "BodyModel", body: str, notes: list[str]) -> np.ndarray | None:

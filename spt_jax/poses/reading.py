@@ -1,6 +1,7 @@
 """Pose files opened: the table of structures, and which of them a file has."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -177,6 +178,13 @@ def read_motion(container: Container) -> MotionFile:
             raise ValueError(
                 f"pose file must hold at least one person: got {source.file!r}, in the "
                 f"structure of {structure.name}, with none"
+            )
+        counts = Counter(track.name for track in tracks)
+        twice = [name for name, count in counts.items() if count > 1]
+        if twice:
+            raise ValueError(
+                f"pose file must call each person by another name: got {twice[0]!r} more than "
+                f"once in {source.file!r}"
             )
         unused = source.unused()
     single = len(tracks) == 1
