@@ -18,7 +18,11 @@ import trimesh
 sys.path.insert(0, sys.argv[1])
 
 import spt_jax
-from spt_jax import host
+
+try:
+    from spt_jax.bridge import callback as host
+except ImportError:  # a tree from before the folder
+    from spt_jax import host
 
 # Frames that collide, to be untangled.
 COLLIDING = (

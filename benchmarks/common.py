@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from spt_jax import config
-from spt_jax.output_files import atomic_write
+from spt_jax.files.outputs import atomic_write
 
 # Batches are timed as those are measured who ask for it.
 config.processes = "auto"

@@ -14,7 +14,7 @@ import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap, self_intersection_penalty
-from spt_jax.device.settings import DEFAULT_RAYS, Xla, bytes_needed, room
+from spt_jax.xla.settings import DEFAULT_RAYS, Xla, bytes_needed, room
 
 # Overlaps smaller than this, in m^3, are left out where differences are parts of the volume.
 _LEAST = 1e-6

@@ -24,7 +24,7 @@ from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.oracles import crossing_pairs, edges_of
 from benchmarks.references import Reference, exact
 from spt_jax import load_body, load_mocap
-from spt_jax.arguments import as_directions
+from spt_jax._query import as_directions
 from spt_jax.overlap.measure import Measurement, Sampling, measure
 
 POSE_DIRECTIONS = 20

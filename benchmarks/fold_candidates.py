@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from spt_jax import RestSurface
-from spt_jax.exclusions import as_exclusions
+from spt_jax._exclusions import as_exclusions
 from spt_jax.overlap.exact import ExactOverlap, Judged
 from spt_jax.overlap.surface import ExactSurface
 

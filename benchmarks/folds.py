@@ -36,7 +36,7 @@ from benchmarks.fold_candidates import (
 )
 from benchmarks.oracles import FAR, RestGraph, far_crossings
 from spt_jax import load_body, load_mocap, self_intersection_penalty
-from spt_jax.rest_surface import local_distances
+from spt_jax.rest.surface import local_distances
 
 _WORKER = Path(__file__).with_name("folds_worker.py")
 NOTHING = 0.0  # m^3: the law, not a tolerance

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fuzz_formats import FORMATS, Arrays, Format, Generator, Written, as_json, as_npz
-from spt_jax.body.pickles import RefusedPickleError
-from spt_jax.file_limits import TooLargeError
+from spt_jax.files.limits import TooLargeError
+from spt_jax.files.pickles import RefusedPickleError
 
 SECONDS = 10  # for a file of some kilobytes
 MEGABYTES = 300  # that reading it may take beyond what the process has

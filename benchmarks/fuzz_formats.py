@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax.body import load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.io.mesh_files import read_mesh
+from spt_jax.io.pose_files import load_poses, read_poses
 from spt_jax.keypoints import read_keypoints
-from spt_jax.mesh_files import read_mesh
-from spt_jax.pose_files import load_poses, read_poses
 from spt_jax.show.overlay import read_image
 
 # The tests' own writers: a module beside no package, so that it is found by its path.

@@ -16,10 +16,10 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from spt_jax.arguments import as_directions
+from spt_jax._penalty import _Options, _value_and_gradient_on_host
+from spt_jax._query import as_directions
 from spt_jax.overlap.exclusions import NOTHING
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
-from spt_jax.penalty import _Options, _value_and_gradient_on_host
 
 KINDS = ("general position", "contact", "coplanar", "duplicated", "sliver", "nested", "open")
 # Relative to the cube of the size, and for laws to the sum of the magnitudes that cancel.

@@ -11,7 +11,7 @@ import trimesh
 
 from benchmarks.common import Table, progress
 from spt_jax import join_bodies, load_body, load_mocap
-from spt_jax.arguments import as_directions, as_rays
+from spt_jax._query import as_directions, as_rays
 from spt_jax.overlap.measure import Sampling, measure
 
 # Milliseconds of one iteration, on another machine, in the paper's Tables 2 and 3.

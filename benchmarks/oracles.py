@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from benchmarks.common import Table, progress
 from spt_jax import BodyModel, load_body, load_mocap
-from spt_jax.output_files import atomic_write
+from spt_jax.files.outputs import atomic_write
 
 # The literature's distance between two ends of a fold (TUCH), and the issue's, for trunk and limbs.
 FAR = 0.3

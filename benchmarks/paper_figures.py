@@ -24,9 +24,9 @@ from benchmarks.paper_runs import (
     run_pairs,
     run_singles,
 )
+from spt_jax._labels import classify_vertices
 from spt_jax.body import BodyModel, load_body
-from spt_jax.labels import classify_vertices
-from spt_jax.output_files import ensure_folder
+from spt_jax.files.outputs import ensure_folder
 from spt_jax.show import plot_curves, render_strip
 
 SHOWN = (0, 10, 20, 30, 300)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 from rich.progress import Progress
 
 from spt_jax import paper_penalty, self_intersection_penalty
+from spt_jax._labels import classify_vertices
 from spt_jax.body import BodyModel, load_mocap
-from spt_jax.labels import classify_vertices
 
 RATE = 1e-4
 EVERY = 10  # the paper shows every tenth iteration

@@ -22,8 +22,9 @@ import numpy as np
 from benchmarks.common import FIGURES, Table, progress, provenance, record_section
 from benchmarks.growth import Growth, draw_growth, measure_growth
 from benchmarks.peers import PEERS, RAYS
-from spt_jax import classify_vertices, host, load_body, load_mocap, self_intersection_penalty
-from spt_jax.output_files import atomic_write
+from spt_jax import classify_vertices, load_body, load_mocap, self_intersection_penalty
+from spt_jax.bridge import callback
+from spt_jax.files.outputs import atomic_write
 
 BASELINE = Path(__file__).with_name("baseline.json")
 FRAME = "crawl/0092"
@@ -62,7 +63,7 @@ def timed(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, np.
         task = bar.add_task("calls", total=(repeats + 1) * len(calls))
         for turn in range(repeats + 1):
             for name, call in calls.items():
-                host.forget()
+                callback.forget()
                 start = time.perf_counter()
                 jax.block_until_ready(call())
                 if turn:
@@ -140,14 +141,14 @@ def end_to_end(repeats: int) -> tuple[Table, list[Metric]]:
 
     # The penalty's own operands and results, and nothing done in between.
     results = ((), "float32"), (tuple(vertices.shape), "float32")
-    empty = jax.jit(lambda v: host.call_on_host(_nothing, (), results, v, body.faces))
+    empty = jax.jit(lambda v: callback.call_on_host(_nothing, (), results, v, body.faces))
 
     def on_the_host():
         found = host_measurement(points, faces)
         return found.volume, found.gradient("boundary", "vertex")
 
     for _ in range(8):  # until batches have been worth another process, and that is there
-        host.forget()
+        callback.forget()
         jax.block_until_ready(many(batch))
         time.sleep(1.0)
     times = timed(
@@ -199,7 +200,7 @@ def _nothing(vertices, faces, options):
 
 def host_measurement(points, faces):
     """A measurement as the callback asks for it."""
-    from spt_jax.arguments import as_directions
+    from spt_jax._query import as_directions
     from spt_jax.overlap.measure import Sampling, measure
 
     return measure(points, faces, Sampling(None, as_directions(3)))

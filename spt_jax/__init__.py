@@ -3,7 +3,7 @@
 import importlib.metadata
 import typing
 
-from spt_jax.lazy import lazy_names as _lazy_names
+from spt_jax._lazy import lazy_names as _lazy_names
 
 if typing.TYPE_CHECKING:
     from spt_jax import fit as fit
@@ -12,38 +12,38 @@ if typing.TYPE_CHECKING:
     from spt_jax import metrics as metrics
     from spt_jax import show as show
     from spt_jax import xla as xla
+    from spt_jax._caches import clear_caches as clear_caches
+    from spt_jax._camera import PinholeCamera as PinholeCamera
+    from spt_jax._geometry import inflate as inflate
+    from spt_jax._groups import Scene as Scene
+    from spt_jax._groups import between_groups as between_groups
+    from spt_jax._groups import join_bodies as join_bodies
+    from spt_jax._groups import within_groups as within_groups
+    from spt_jax._labels import VertexLabels as VertexLabels
+    from spt_jax._labels import classify_vertices as classify_vertices
+    from spt_jax._mesh_check import MeshCheck as MeshCheck
+    from spt_jax._mesh_check import check_mesh as check_mesh
+    from spt_jax._penalty import paper_penalty as paper_penalty
+    from spt_jax._penalty import self_intersection_penalty as self_intersection_penalty
+    from spt_jax._report import IntersectionReport as IntersectionReport
+    from spt_jax._report import intersection_report as intersection_report
+    from spt_jax._result import Overlap as Overlap
+    from spt_jax._settings import config as config
+    from spt_jax._status import RESULTS as RESULTS
     from spt_jax.body import BodyModel as BodyModel
     from spt_jax.body import PosedBody as PosedBody
     from spt_jax.body import load_body as load_body
     from spt_jax.body import load_mocap as load_mocap
-    from spt_jax.caches import clear_caches as clear_caches
-    from spt_jax.camera import PinholeCamera as PinholeCamera
     from spt_jax.fit.people import Penetration as Penetration
     from spt_jax.fit.people import PeopleResult as PeopleResult
     from spt_jax.fit.people import fit_people as fit_people
     from spt_jax.fit.pose import fit_pose as fit_pose
     from spt_jax.fit.result import FitResult as FitResult
-    from spt_jax.geometry import inflate as inflate
-    from spt_jax.groups import Scene as Scene
-    from spt_jax.groups import between_groups as between_groups
-    from spt_jax.groups import join_bodies as join_bodies
-    from spt_jax.groups import within_groups as within_groups
+    from spt_jax.io.pose_files import load_poses as load_poses
     from spt_jax.keypoints import KeypointRegressor as KeypointRegressor
     from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
     from spt_jax.keypoints import read_keypoints as read_keypoints
-    from spt_jax.labels import VertexLabels as VertexLabels
-    from spt_jax.labels import classify_vertices as classify_vertices
-    from spt_jax.mesh_check import MeshCheck as MeshCheck
-    from spt_jax.mesh_check import check_mesh as check_mesh
-    from spt_jax.penalty import paper_penalty as paper_penalty
-    from spt_jax.penalty import self_intersection_penalty as self_intersection_penalty
-    from spt_jax.pose_files import load_poses as load_poses
-    from spt_jax.report import IntersectionReport as IntersectionReport
-    from spt_jax.report import intersection_report as intersection_report
-    from spt_jax.rest_surface import RestSurface as RestSurface
-    from spt_jax.result import Overlap as Overlap
-    from spt_jax.settings import config as config
-    from spt_jax.status import RESULTS as RESULTS
+    from spt_jax.rest.surface import RestSurface as RestSurface
     from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
     from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
     from spt_jax.untangle.motion import MotionResult as MotionResult
@@ -111,36 +111,36 @@ __getattr__, __dir__ = _lazy_names(
         "PosedBody": "spt_jax.body",
         "load_body": "spt_jax.body",
         "load_mocap": "spt_jax.body",
-        "clear_caches": "spt_jax.caches",
-        "PinholeCamera": "spt_jax.camera",
-        "inflate": "spt_jax.geometry",
-        "Scene": "spt_jax.groups",
-        "between_groups": "spt_jax.groups",
-        "join_bodies": "spt_jax.groups",
-        "within_groups": "spt_jax.groups",
-        "VertexLabels": "spt_jax.labels",
-        "classify_vertices": "spt_jax.labels",
-        "MeshCheck": "spt_jax.mesh_check",
-        "check_mesh": "spt_jax.mesh_check",
-        "paper_penalty": "spt_jax.penalty",
-        "self_intersection_penalty": "spt_jax.penalty",
-        "IntersectionReport": "spt_jax.report",
-        "intersection_report": "spt_jax.report",
-        "RestSurface": "spt_jax.rest_surface",
-        "Overlap": "spt_jax.result",
-        "config": "spt_jax.settings",
+        "clear_caches": "spt_jax._caches",
+        "PinholeCamera": "spt_jax._camera",
+        "inflate": "spt_jax._geometry",
+        "Scene": "spt_jax._groups",
+        "between_groups": "spt_jax._groups",
+        "join_bodies": "spt_jax._groups",
+        "within_groups": "spt_jax._groups",
+        "VertexLabels": "spt_jax._labels",
+        "classify_vertices": "spt_jax._labels",
+        "MeshCheck": "spt_jax._mesh_check",
+        "check_mesh": "spt_jax._mesh_check",
+        "paper_penalty": "spt_jax._penalty",
+        "self_intersection_penalty": "spt_jax._penalty",
+        "IntersectionReport": "spt_jax._report",
+        "intersection_report": "spt_jax._report",
+        "RestSurface": "spt_jax.rest.surface",
+        "Overlap": "spt_jax._result",
+        "config": "spt_jax._settings",
         "FitResult": "spt_jax.fit.result",
         "KeypointRegressor": "spt_jax.keypoints",
         "Penetration": "spt_jax.fit.people",
         "PeopleResult": "spt_jax.fit.people",
-        "RESULTS": "spt_jax.status",
+        "RESULTS": "spt_jax._status",
         "Step": "spt_jax.untangle.steps",
         "UntangleMeshResult": "spt_jax.untangle.mesh",
         "UntangleResult": "spt_jax.untangle.pose",
         "fit_people": "spt_jax.fit.people",
         "fit_pose": "spt_jax.fit.pose",
         "keypoint_regressor": "spt_jax.keypoints",
-        "load_poses": "spt_jax.pose_files",
+        "load_poses": "spt_jax.io.pose_files",
         "read_keypoints": "spt_jax.keypoints",
         "untangle_mesh": "spt_jax.untangle.mesh",
         "MotionResult": "spt_jax.untangle.motion",

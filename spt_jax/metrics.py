@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.arguments import as_mesh
-from spt_jax.exclusions import as_exclusions
-from spt_jax.host_side import Work, measured
+from spt_jax._exclusions import as_exclusions
+from spt_jax._query import as_mesh
+from spt_jax._result import Result, plain
+from spt_jax.bridge.on_host import Work, measured
 from spt_jax.overlap.depth import penetration_depths
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Sampling, Unmeasurable, measure
-from spt_jax.rest_surface import RestSurface
-from spt_jax.result import Result, plain
+from spt_jax.rest.surface import RestSurface
 
 __all__ = ["MotionOverlap", "motion_overlap", "rejected"]
 

@@ -11,7 +11,7 @@ import scipy
 from helpers import body_faces, embedded_body
 from scipy.sparse.csgraph import dijkstra
 
-from spt_jax.exclusions import as_exclusions
+from spt_jax._exclusions import as_exclusions
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.surface import ExactSurface
 

@@ -8,7 +8,7 @@ from helpers_body import slow_rotation
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spt_jax.camera import PinholeCamera
+from spt_jax._camera import PinholeCamera
 
 _TURN = slow_rotation(np.array([0.4, -1.1, 2.0]))
 

@@ -29,7 +29,7 @@ from spt_jax import (
     self_intersection_penalty,
     within_groups,
 )
-from spt_jax.exclusions import as_exclusions
+from spt_jax._exclusions import as_exclusions
 from spt_jax.overlap.measure import measure
 
 # Three balls in a row: the first two overlap, and the last two.

@@ -4,7 +4,7 @@ import inspect
 import typing
 
 from spt_jax import fit_pose, self_intersection_penalty
-from spt_jax.commands.fit import fit
+from spt_jax.cli.fit import fit
 from spt_jax.fit.terms.regularisers import NAMED, SelfIntersection
 from spt_jax.overlap.measure import Value
 

@@ -8,7 +8,7 @@ import scipy
 from helpers import bent_tube, body_faces, box, inverted, moved, posed_bodies, random_rotation
 from helpers import sphere as solid_sphere
 
-from spt_jax.geometry import FARTHEST, inflate
+from spt_jax._geometry import FARTHEST, inflate
 
 
 def normals(vertices, faces):

@@ -7,7 +7,7 @@ import pytest
 from helpers import box, embedded_body, lens_volume, sphere
 
 from spt_jax import self_intersection_penalty
-from spt_jax.groups import (
+from spt_jax._groups import (
     between_groups,
     join_bodies,
     neighbour_pairs,

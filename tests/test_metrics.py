@@ -10,7 +10,7 @@ from helpers import box, sphere
 
 from spt_jax.metrics import MotionOverlap, motion_overlap, rejected
 from spt_jax.overlap.depth import penetration_depths
-from spt_jax.rest_surface import RestSurface
+from spt_jax.rest.surface import RestSurface
 
 
 def joined(*meshes):

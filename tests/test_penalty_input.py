@@ -9,8 +9,8 @@ from helpers import box, embedded_body
 from helpers_penalty import FACES, PAIR, as_jax, loss
 
 from spt_jax import RestSurface, classify_vertices, intersection_report, self_intersection_penalty
-from spt_jax.device.settings import Xla
 from spt_jax.overlap.triangles import pairs
+from spt_jax.xla.settings import Xla
 
 OPTIONS = {
     "default": {},

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spt_jax import classify_vertices, self_intersection_penalty
-from spt_jax.mesh_check import check_mesh
-from spt_jax.report import intersection_report
+from spt_jax._mesh_check import check_mesh
+from spt_jax._report import intersection_report
 
 CLEAN = {
     "nonfinite_vertices": 0,

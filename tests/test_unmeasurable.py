@@ -13,7 +13,7 @@ from spt_jax import (
     self_intersection_penalty,
     untangle_mesh,
 )
-from spt_jax.cli import main
+from spt_jax.cli.main import main
 from spt_jax.overlap.measure import Unmeasurable, measure
 from spt_jax.overlap.triangles import pairs
 from spt_jax.view.scene import Scene

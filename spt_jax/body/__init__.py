@@ -1,7 +1,7 @@
 """The body model: blend shapes, a kinematic tree and linear blend skinning in JAX."""
 
-from .files import load_body as load_body
-from .mocap import Mocap as Mocap
-from .mocap import load_mocap as load_mocap
-from .model import BodyModel as BodyModel
-from .model import PosedBody as PosedBody
+from spt_jax.body.files import load_body as load_body
+from spt_jax.body.mocap import Mocap as Mocap
+from spt_jax.body.mocap import load_mocap as load_mocap
+from spt_jax.body.model import BodyModel as BodyModel
+from spt_jax.body.model import PosedBody as PosedBody

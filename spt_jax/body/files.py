@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import DTypeLike
 
-from spt_jax.file_limits import as_file, file_errors, read_bytes, read_npz
-
-from .model import BodyModel
-from .pickles import dense_array, read_pickle
-from .poses import SMPL_LAYOUTS
+from spt_jax.body.model import BodyModel
+from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.files.limits import as_file, file_errors, read_bytes, read_npz
+from spt_jax.files.pickles import dense_array, read_pickle
 
 _KEYS = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 # SMPL-X keeps expressions behind the shape components: 300 + 100, or 10 + 10 in its small files.

@@ -10,20 +10,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float, Int
 
+from spt_jax._groups import Pairs, neighbour_pairs, part_groups
+from spt_jax.body import poses
 from spt_jax.body.fold_distances import fold_distances
-from spt_jax.groups import Pairs, neighbour_pairs, part_groups
-from spt_jax.rest_surface import RestSurface
-
-from . import poses
-from .model_check import check_model
-from .rotations import matrix_from_axis_angle
-from .skinning import (
+from spt_jax.body.model_check import check_model
+from spt_jax.body.rotations import matrix_from_axis_angle
+from spt_jax.body.skinning import (
     blend_shapes,
     displacement,
     forward_kinematics,
     lift,
     linear_blend_skinning,
 )
+from spt_jax.rest.surface import RestSurface
 
 
 class PosedBody(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 from jax.core import Tracer
 
 if TYPE_CHECKING:
-    from .model import BodyModel
+    from spt_jax.body.model import BodyModel
 
 
 def check_model(body: "BodyModel") -> None:

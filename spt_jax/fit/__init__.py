@@ -2,7 +2,7 @@
 
 import typing
 
-from spt_jax.lazy import lazy_names as _lazy_names
+from spt_jax._lazy import lazy_names as _lazy_names
 
 if typing.TYPE_CHECKING:
     from spt_jax.fit.figure import Variables as Variables

@@ -10,10 +10,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from spt_jax.arguments import as_margin
+from spt_jax._camera import PinholeCamera
+from spt_jax._exclusions import as_fold_surface
+from spt_jax._groups import between_groups, join_bodies, within_groups
+from spt_jax._query import as_margin
+from spt_jax._report import intersection_report
+from spt_jax._result import Result, plain
+from spt_jax._status import RESULTS
 from spt_jax.body import BodyModel
-from spt_jax.camera import PinholeCamera
-from spt_jax.exclusions import as_fold_surface
 from spt_jax.fit.inputs import Person
 from spt_jax.fit.pose import fit_pose
 from spt_jax.fit.programs import program
@@ -21,12 +25,8 @@ from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import descend
 from spt_jax.fit.terms.regularisers import SelfIntersection, as_weights
-from spt_jax.groups import between_groups, join_bodies, within_groups
 from spt_jax.overlap.measure import Unmeasurable
-from spt_jax.report import intersection_report
-from spt_jax.rest_surface import RestSurface
-from spt_jax.result import Result, plain
-from spt_jax.status import RESULTS
+from spt_jax.rest.surface import RestSurface
 
 # What is tried where people still intersect: the margin, times this, with the last weight again.
 _WIDER = (2.0, 4.0, 8.0)

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spt_jax.camera import PinholeCamera
+from spt_jax._camera import PinholeCamera
+from spt_jax._status import RESULTS
 from spt_jax.fit.objective import Objective
-from spt_jax.status import RESULTS
 
 # In metres, of what was seen of a person: from a hand before the lens to a figure at which COCO's
 # annotators stop marking keypoints, about 30 pixels tall, under the longest of lenses.
@@ -63,7 +63,7 @@ def is_too_wide(camera: PinholeCamera, size: tuple[int, int]) -> bool:
     """Whether an image of that width and height has a corner that no lens would show.
 
     Example:
-        >>> from spt_jax.camera import PinholeCamera
+        >>> from spt_jax._camera import PinholeCamera
         >>> is_too_wide(PinholeCamera(35.0, (320.0, 240.0)), (640, 480))  # millimetres
         True
     """

@@ -8,8 +8,8 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from spt_jax._camera import PinholeCamera
 from spt_jax.body import BodyModel
-from spt_jax.camera import PinholeCamera
 from spt_jax.fit.inputs import Person
 from spt_jax.fit.programs import program
 from spt_jax.fit.result import FitResult, fit_result

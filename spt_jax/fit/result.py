@@ -5,11 +5,11 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from spt_jax._result import Result, plain
+from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax.body import BodyModel
 from spt_jax.fit import photograph
 from spt_jax.fit.objective import Objective
-from spt_jax.result import Result, plain
-from spt_jax.status import RESULTS, in_words, names_of
 
 _WORDS = {
     "successful": "converged",

@@ -10,8 +10,8 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array
 
+from spt_jax._camera import PinholeCamera
 from spt_jax.body import BodyModel
-from spt_jax.camera import PinholeCamera
 from spt_jax.fit.figure import Figure, Variables, make_figure
 from spt_jax.fit.inputs import Person, as_people, count_points
 from spt_jax.fit.objective import Objective, Weights, as_seen

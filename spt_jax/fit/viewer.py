@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from spt_jax._camera import PinholeCamera
 from spt_jax.body import BodyModel
 from spt_jax.body.rotations import axis_angle_from_matrix
-from spt_jax.camera import PinholeCamera
 from spt_jax.fit.figure import Variables
 
 # From the camera's axes (y down, z forward) to the viewer's.

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .confidences import shown
-from .layouts import LAYOUTS, Layout, as_layout
+from spt_jax.keypoints.confidences import shown
+from spt_jax.keypoints.layouts import LAYOUTS, Layout, as_layout
 
 #: Confidence of a point that COCO's annotators marked as hidden (v = 1): they guessed its place.
 OCCLUDED = 0.5

@@ -6,11 +6,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from spt_jax.file_limits import as_file, read_json, read_npz
-
-from .confidences import CONFIDENCES
-from .entries import Person
-from .formats import (
+from spt_jax.files.limits import as_file, read_json, read_npz
+from spt_jax.keypoints.confidences import CONFIDENCES
+from spt_jax.keypoints.entries import Person
+from spt_jax.keypoints.formats import (
     ACCEPTED,
     NO_VISIBLE_POINT,
     Source,
@@ -21,7 +20,7 @@ from .formats import (
     from_results,
     is_openpose,
 )
-from .pixels import SIZES, in_pixels
+from spt_jax.keypoints.pixels import SIZES, in_pixels
 
 _WHAT = "keypoint file"
 _KNOWN = {"keypoints", "layout", "image", *CONFIDENCES, *(name for pair in SIZES for name in pair)}

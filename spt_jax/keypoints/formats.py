@@ -5,10 +5,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .confidences import CONFIDENCES, as_list, as_rows, refuse_unknown_numbers, shape_of, shown
-from .entries import Person, as_label, as_number, as_points, as_size, choose_layout
-from .layouts import LAYOUTS
-from .pixels import canvas_size
+from spt_jax.keypoints.confidences import (
+    CONFIDENCES,
+    as_list,
+    as_rows,
+    refuse_unknown_numbers,
+    shape_of,
+    shown,
+)
+from spt_jax.keypoints.entries import Person, as_label, as_number, as_points, as_size, choose_layout
+from spt_jax.keypoints.layouts import LAYOUTS
+from spt_jax.keypoints.pixels import canvas_size
 
 ACCEPTED = (
     'COCO annotations ({"images", "annotations", "categories"}), COCO results ([{"image_id", '

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .entries import Person, as_size
+from spt_jax.keypoints.entries import Person, as_size
 
 #: What the width and height of an image are called.
 SIZES = (

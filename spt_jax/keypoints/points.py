@@ -7,8 +7,7 @@ import numpy as np
 from jax.core import Tracer
 
 from spt_jax.body import BodyModel
-
-from .landmarks import LANDMARKS
+from spt_jax.keypoints.landmarks import LANDMARKS
 
 # COCO's and OpenPose's hips are about two thirds as far apart as their shoulders, 0.24 m on an
 # adult, and that is 0.65 of the width of the skin there. SMPL's hip joints are about a third of

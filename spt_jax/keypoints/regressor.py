@@ -11,10 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from spt_jax.body import BodyModel, PosedBody
-
-from .landmarks import LANDMARKS, find_landmarks
-from .layouts import as_layout
-from .points import COMBINATIONS, needs_landmarks, weights_of
+from spt_jax.keypoints.landmarks import LANDMARKS, find_landmarks
+from spt_jax.keypoints.layouts import as_layout
+from spt_jax.keypoints.points import COMBINATIONS, needs_landmarks, weights_of
 
 
 class KeypointRegressor(eqx.Module):

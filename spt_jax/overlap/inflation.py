@@ -1,4 +1,4 @@
-"""The surface moved outwards, as `spt_jax.geometry.inflate` does, and forces on it pulled back.
+"""The surface moved outwards, as `spt_jax._geometry.inflate` does, and forces on it pulled back.
 
 In NumPy, for the host: all triangles' normals and angles are taken once, and of the derivative only
 what belongs to vertices with a force on them, which is a few hundredths of a body.

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.mesh_files import as_mesh_arrays
+from spt_jax.io.mesh_files import as_mesh_arrays
 from spt_jax.show.framing import Framing, View, frame
 from spt_jax.show.look import INK, Picture, check_png, check_size, finished
 from spt_jax.show.offscreen import import_extra

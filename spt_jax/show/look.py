@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from spt_jax.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
-from spt_jax.output_files import atomic_write
+from spt_jax.files.outputs import atomic_write
+from spt_jax.io.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.show.offscreen import import_extra
 
 Picture = UInt8[np.ndarray, "height width 3"]

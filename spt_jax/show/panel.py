@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from spt_jax.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
+from spt_jax.io.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.show.framing import Framing, marked_triangles
 from spt_jax.show.look import BACKGROUND, LIGHTS, MATERIAL
 from spt_jax.show.offscreen import import_extra, offscreen_plotter

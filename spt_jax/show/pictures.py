@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from spt_jax.mesh_files import as_mesh_arrays
+from spt_jax.io.mesh_files import as_mesh_arrays
 from spt_jax.show.framing import View, frame
 from spt_jax.show.look import GAP, Picture, check_png, check_size, finished, write_texts
 from spt_jax.show.panel import draw_panel, panel_plotter

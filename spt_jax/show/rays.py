@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from spt_jax.mesh_files import as_mesh_arrays
+from spt_jax.io.mesh_files import as_mesh_arrays
 from spt_jax.overlap.rays.beam import Beam, ScreenPoints, on_lattice
 from spt_jax.overlap.rays.crossings import Crossings, cast
 from spt_jax.overlap.rays.levels import find_overlaps, winding_numbers

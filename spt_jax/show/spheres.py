@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from spt_jax.body import BodyModel
 from spt_jax.fit.terms.spheres import BodySpheres, sphere_depths
-from spt_jax.mesh_files import PENETRATING_COLOR
+from spt_jax.io.mesh_files import PENETRATING_COLOR
 from spt_jax.show.framing import View, frame
 from spt_jax.show.look import GAP, MATERIAL, Picture, check_png, check_size, finished
 from spt_jax.show.offscreen import import_extra

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from spt_jax._geometry import inflate
+from spt_jax._penalty import self_intersection_penalty
 from spt_jax.body import BodyModel
 from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from spt_jax.geometry import inflate
-from spt_jax.penalty import self_intersection_penalty
-from spt_jax.rest_surface import RestSurface
+from spt_jax.rest.surface import RestSurface
 from spt_jax.untangle.descent import CENTIMETRE, STIFFNESS
 
 # Vertices and frames by which a window's displacements are weighed.

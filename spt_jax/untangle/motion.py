@@ -9,13 +9,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from spt_jax.arguments import as_margin
+from spt_jax._exclusions import as_fold_surface
+from spt_jax._query import as_margin
+from spt_jax._result import Result, plain
+from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax.body import BodyModel
-from spt_jax.exclusions import as_fold_surface
 from spt_jax.metrics import MotionOverlap
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.result import Result, plain
-from spt_jax.status import RESULTS, in_words, names_of
 from spt_jax.untangle.corrections import Corrections, Frames, displacement_factor
 from spt_jax.untangle.feet import standing_feet
 from spt_jax.untangle.frame_cuts import prior

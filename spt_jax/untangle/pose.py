@@ -9,13 +9,13 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from spt_jax.arguments import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
+from spt_jax._exclusions import as_fold_surface
+from spt_jax._query import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
+from spt_jax._result import Overlap, Result, plain
+from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax.body import BodyModel
-from spt_jax.exclusions import as_fold_surface
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable
 from spt_jax.overlap.rays.beam import Rays
-from spt_jax.result import Overlap, Result, plain
-from spt_jax.status import RESULTS, in_words, names_of
 from spt_jax.untangle.descent import (
     SOLVER,
     Folds,

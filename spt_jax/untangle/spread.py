@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int, Shaped
 
-from spt_jax.mesh_edges import connected
+from spt_jax.overlap.topology import connected
 from spt_jax.overlap.vectors import cross, dot, summed
 
 

@@ -9,12 +9,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
+from spt_jax._mesh_check import check_mesh
 from spt_jax.body import BodyModel, load_body, load_mocap
 from spt_jax.body.poses import SMPL_LAYOUTS
-from spt_jax.file_limits import as_file, read_bytes, read_npz
-from spt_jax.mesh_check import check_mesh
-from spt_jax.mesh_files import read_mesh, write_mesh
-from spt_jax.pose_files import MotionFile, Track, is_pose_file, open_poses, write_poses
+from spt_jax.files.limits import as_file, read_bytes, read_npz
+from spt_jax.io.mesh_files import read_mesh, write_mesh
+from spt_jax.io.pose_files import MotionFile, Track, is_pose_file, open_poses, write_poses
 from spt_jax.view.scene import Reading, Scene
 
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}", re.ASCII)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from spt_jax.arguments import as_directions
+from spt_jax._query import as_directions
 from spt_jax.overlap.measure import Sampling
 from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.pose import untangle_pose

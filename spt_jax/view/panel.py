@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from spt_jax.mesh_files import INVERTED_COLOR, PENETRATING_COLOR
+from spt_jax.io.mesh_files import INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.view.files import Frames
 from spt_jax.view.scene import Reading, Scene, body_parts
 

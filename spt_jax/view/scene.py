@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int, Int8
 from scipy.spatial.transform import Rotation
 
-from spt_jax.arguments import as_directions
+from spt_jax._query import as_directions
 from spt_jax.body import BodyModel
-from spt_jax.mesh_files import fits_single
+from spt_jax.io.mesh_files import fits_single
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.overlap.labels import LabelCounts, count_labels
 from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure

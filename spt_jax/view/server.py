@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from spt_jax._mesh_check import check_mesh
 from spt_jax.body import load_body
-from spt_jax.mesh_check import check_mesh
-from spt_jax.pose_files import MotionFile
+from spt_jax.io.pose_files import MotionFile
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
 from spt_jax.view.freeing import untangle_scene

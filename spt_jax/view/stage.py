@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
+from spt_jax.io.mesh_files import BODY_COLOR, INVERTED_COLOR, PENETRATING_COLOR
 from spt_jax.overlap.labels import PENETRATING
 from spt_jax.show.framing import frame, marked_triangles
 from spt_jax.show.look import BACKGROUND

@@ -7,8 +7,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Integer
 
-from spt_jax.arguments import as_mesh
-from spt_jax.mesh_edges import Edges
+from spt_jax._query import as_mesh
+from spt_jax.overlap.topology import Edges
 
 
 class MeshLaplacian(eqx.Module):

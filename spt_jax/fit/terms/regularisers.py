@@ -12,17 +12,17 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from spt_jax.arguments import as_choice, as_directions, as_margin, as_rays
+from spt_jax._exclusions import as_fold_surface
+from spt_jax._geometry import inflate
+from spt_jax._groups import join_bodies
+from spt_jax._penalty import self_intersection_penalty
+from spt_jax._query import as_choice, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
-from spt_jax.exclusions import as_fold_surface
 from spt_jax.fit.figure import Variables
 from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
 from spt_jax.fit.terms.spheres import BodySpheres, sphere_penalty
-from spt_jax.geometry import inflate
-from spt_jax.groups import join_bodies
 from spt_jax.overlap.rays.beam import Rays
-from spt_jax.penalty import self_intersection_penalty
-from spt_jax.rest_surface import RestSurface
+from spt_jax.rest.surface import RestSurface
 
 _CENTIMETRE = 0.01
 

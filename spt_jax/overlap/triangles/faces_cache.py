@@ -43,7 +43,7 @@ class FacesCache(Generic[_Kept]):
                 if size == count and (faces is known or np.array_equal(known, faces)):
                     self._kept.move_to_end(key)
                     return made
-        # Faces that nobody may write to, such as those from `host.py`, are known again as they are.
+        # Read-only faces, such as those from `bridge/callback.py`, are known again as they are.
         own = faces.astype(np.int64, copy=faces.flags.writeable)
         made = self._make(own, count)
         with self._lock:

@@ -1,0 +1,341 @@
+"""The penalty: overlap volume or the paper's ratio, with a gradient that comes from geometry."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Integer
+
+from spt_jax._exclusions import as_exclusions
+from spt_jax._geometry import inflate
+from spt_jax._query import (
+    as_backend,
+    as_choice,
+    as_directions,
+    as_faces,
+    as_margin,
+    as_rays,
+    as_vertices,
+)
+from spt_jax.bridge.bounded_jit import BoundedJit
+from spt_jax.bridge.callback import call_on_host, is_local
+from spt_jax.bridge.reverse_only import refuse_forward, with_slope
+from spt_jax.overlap.convex import is_small_convex_solid
+from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.inflation import Inflated
+from spt_jax.overlap.measure import (
+    Gradient,
+    Rule,
+    Sampling,
+    Unmeasurable,
+    Value,
+    check_usable,
+    measure,
+)
+from spt_jax.overlap.rays.beam import Rays
+from spt_jax.rest.surface import RestSurface
+from spt_jax.xla.backend import Program, Task, as_task, penalty_on_device
+from spt_jax.xla.settings import Xla
+
+
+def self_intersection_penalty(
+    vertices: Float[Array, "*batch V 3"] | np.ndarray,
+    faces: Integer[Array, "F 3"] | np.ndarray,
+    *,
+    value: Value = "volume",
+    gradient: Gradient = "boundary",
+    rule: Rule = "vertex",
+    rays: Rays = None,
+    directions: Any = 3,
+    margin: float = 0.0,
+    face_groups: Integer[Array, "F"] | np.ndarray | None = None,
+    ignore_groups: Any = (),
+    rest_surface: RestSurface | None = None,
+    backend: str | Xla = "auto",
+) -> Float[Array, "*batch"]:
+    r"""Volume of a closed mesh's self-intersection, as a loss with its own exact gradient.
+
+    With w the winding number, the volume is the integral of w (w - 1) / 2 over space: every two
+    solids that overlap in a place count once there. That is the paper's Eq. 1 where two overlap
+    (it stops at two); where three do it is 3, and where the surface is inside out 1. So it is a sum
+    over pairs: that within each of several bodies and that between them add up to the whole. It
+    is exact at any depth, in contact and for parts that coincide, from the triangles alone, or with
+    `rays` the paper's sampling (section 3.2): the mean over directions of the overlapped length on
+    the rays times the area of a ray. Without overlap, value and gradient are exactly zero; surfaces
+    that only touch, but for rounding, do not overlap.
+
+    Args:
+        vertices: positions of one mesh or of a batch that shares its faces, in any unit.
+        faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
+            must be closed and consistently wound (`check_mesh` tells); it need not be connected.
+            Holes are closed by a fan to the mean of their boundary's vertices.
+        value: "volume", in the cube of the unit, or "ratio", the paper's Eq. 11: the part of the
+            vertices in self-intersection, piecewise constant and not what the gradient derives.
+        gradient: "boundary", the derivative of the volume; "vertex", the paper's Eq. 9, which
+            takes each triangle as wholly in or out; "unit", its Eq. 10, of length one at every
+            vertex in self-intersection.
+        rule: how "ratio", "vertex" and "unit" label the vertices, as in `classify_vertices`.
+        rays: None computes the volume in closed form, exact to rounding, so that it is smooth and
+            its gradient exact, however the mesh is turned. (Should the sums of the closed form not
+            close, which no closed mesh has been seen to do, 512 rays a side take over;
+            `intersection_report` says so.) A number of rays along the longer side of the screen, or
+            (rows, columns), samples it as the paper does.
+        directions: of the rays, where any are cast: 1 (along -z, the paper's camera), 3 orthogonal
+            ones, or the rows of a D x 3 array. With one, "boundary" is the exact derivative of the
+            sampled volume; with several, crossings are weighed by how well their direction sees the
+            triangle, which is closer to the limit of many rays.
+        margin: how far apart sheets shall be, in the vertices' unit. What is measured is the
+            surface moved outwards by half of it, `spt_jax.inflate`: where that no longer
+            overlaps, value and gradient are zero and sheets that face each other are `margin`
+            apart. Concave creases narrower than the margin fold when moved, and count.
+        face_groups: a whole number for each triangle: its body part or person
+            (`body.part_groups`, `join_bodies`).
+        ignore_groups: pairs of groups whose overlaps do not count, such as ((0, 0), (1, 1)) for
+            "only between the two people". Between groups that are closed by themselves that is
+            exact at any depth: what is within and what is between add up to the whole, to
+            rounding. Groups that are parts of one surface are judged by
+            their contours, as folds are.
+        rest_surface: the surface at rest (`body.rest_surface`), to leave out folds. Intersecting
+            triangles that are near each other along it (within 0.3 m on trunk and limbs, 2 to 4 cm
+            on fingers) are a fold of the skin, made by bending. An overlap region counts by the
+            fraction of its intersection contour's length that is not a fold: entirely for two
+            limbs, not at all for the crease of an elbow. The fraction is differentiated too. Parts
+            that are enclosed in each other at rest, as eyeballs in a head, do not count. None:
+            every overlap counts.
+        backend: "numpy": on the host; "xla", or `spt_jax.xla.Xla` with the sizes of its
+            arrays: in JAX alone, where the vertices are; "auto": "numpy", also where JAX runs on a
+            GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and tells
+            folds and groups by what the rays meet (`spt_jax.xla`; `python -m benchmarks.device`
+            prints how far off it is).
+
+    Returns:
+        One number per mesh, in the vertices' dtype. A volume that the dtype cannot tell from zero
+        is zero, with a zero gradient. NaN, with a zero gradient, where value or gradient are more
+        than the dtype can hold, or there is no surface to measure: a vertex is not finite, a traced
+        face is out of range, the mesh is smaller than 1024 units in the last place of its
+        coordinates, or so crumpled that more than 20 pairs of triangles to a triangle (and
+        2,000,000) are near each other.
+
+    Raises:
+        TypeError: vertices not float32 or float64; faces or groups not whole numbers; rays,
+            directions, margin or groups that are no numbers, or are traced; a rest_surface of
+            another type.
+        ValueError: wrong shapes; a face out of range; rays not positive; directions zero or not
+            finite; a margin that is negative or not finite; groups or a rest surface that do not
+            fit the faces; an unknown option.
+
+    Differentiation: reverse mode (`jax.grad`, `jax.vjp`, `jac="bwd"` in optimistix) with respect to
+        vertices. Forward mode (`jax.jvp`, `jax.jacfwd`, calling what `jax.linearize` returns) is
+        refused by name. The gradient is computed with the value and held fixed: in second
+        derivatives the penalty E counts as linear, so that the Hessian of f(E) is f''(E) g g^T with
+        g its gradient: 2 g g^T for its square, without f'(E) times the curvature of E itself. With
+        a margin, every kind of gradient is that of the moved surface, carried back to `vertices` by
+        the chain rule. A batch that is sharded over devices stays so; inside `jax.shard_map` pass
+        it check_vma=False. `jax.export` holds `backend="xla"` alone and refuses the others by name.
+
+    Example:
+        >>> import jax, trimesh
+        >>> from spt_jax import self_intersection_penalty
+        >>> box = trimesh.creation.box()
+        >>> pair = trimesh.util.concatenate(box, box.copy().apply_translation([0.6, 0.0, 0.0]))
+        >>> vertices = jax.numpy.asarray(pair.vertices, "float32")
+        >>> loss = lambda v: self_intersection_penalty(v, pair.faces)
+        >>> volume, gradient = jax.value_and_grad(loss)(vertices)
+        >>> print(f"{volume:.2f}")
+        0.40
+        >>> push = gradient[8:].sum(axis=0)  # how the overlap grows when the second box moves
+        >>> print(f"{push[0]:.1f}")
+        -1.0
+    """
+    vertices = as_vertices(vertices)
+    faces = as_faces(faces, vertices.shape[-2])
+    apart = as_margin(margin)
+    options = _Options(
+        as_choice("value", value, Value),
+        as_choice("gradient", gradient, Gradient),
+        as_choice("rule", rule, Rule),
+        Sampling(as_rays(rays), as_directions(directions)),
+        as_exclusions(face_groups, ignore_groups, rest_surface, faces),
+        float(np.finfo(vertices.dtype).eps),
+        apart / 2,
+    )
+    device = as_backend(backend)
+    if apart and device is not None:
+        vertices = inflate(vertices, faces, apart / 2)
+    vertices = refuse_forward(vertices)
+    if device is not None:
+        program = Program(device, options.sampling.rays, options.value, None, options.rule)
+        task = as_task(program, options.sampling, vertices.dtype, options.exclusions)
+        way = program, options.gradient
+        return _on_device(way, vertices, jnp.asarray(faces), task.tables)
+    if isinstance(faces, Tracer):
+        return _differentiable(options, None, vertices, faces)
+    return _differentiable(options, _Known(np.asarray(faces)), vertices, ())
+
+
+def paper_penalty(
+    vertices: Float[Array, "*batch V 3"] | np.ndarray,
+    faces: Integer[Array, "F 3"] | np.ndarray,
+    *,
+    rays: int | tuple[int, int] = 512,
+    normalize: bool = True,
+    backend: str | Xla = "auto",
+) -> Float[Array, "*batch"]:
+    """The paper to the letter: one direction, Algorithm 1, the ratio, Eq. 10 or 9.
+
+    The value is Eq. 11, the fraction of the vertices that are penetrating or inverted (V_out or
+    V_in). The gradient is Eq. 10 (`normalize`) or Eq. 9. They are not each other's derivative, so a
+    line search on this pair fails; it is meant for plain gradient descent. For anything else use
+    `self_intersection_penalty`.
+
+    Args:
+        vertices: positions of one mesh or of a batch that shares its faces, in any unit.
+        faces: indices of each triangle's corners, counter-clockwise seen from outside.
+        rays: rays along the longer side of the screen, or (rows, columns).
+        normalize: Eq. 10, unit vectors, rather than Eq. 9, a third of the area normals.
+        backend: as in `self_intersection_penalty`.
+
+    Returns:
+        One ratio per mesh, in the vertices' dtype; NaN for vertices that are not finite.
+
+    Raises:
+        TypeError, ValueError: as `self_intersection_penalty`.
+
+    Differentiation: as `self_intersection_penalty`.
+
+    Example:
+        >>> import jax.numpy as jnp, trimesh
+        >>> from spt_jax import paper_penalty
+        >>> box = trimesh.creation.box()
+        >>> print(paper_penalty(jnp.asarray(box.vertices, "float32"), box.faces))
+        0.0
+    """
+    return self_intersection_penalty(
+        vertices,
+        faces,
+        value="ratio",
+        gradient="unit" if normalize else "vertex",
+        rule="triangle",
+        rays=rays,
+        directions=1,
+        backend=backend,
+    )
+
+
+class _Options(NamedTuple):
+    value: Value
+    gradient: Gradient
+    rule: Rule
+    sampling: Sampling
+    exclusions: Exclusions
+    rounding: float  # machine epsilon of the vertices
+    outwards: float = 0.0  # how far the surface is moved before it is measured
+
+
+class _Known(NamedTuple):
+    """Faces whose values are known: no operand, and nothing to differentiate."""
+
+    faces: np.ndarray
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _differentiable(options, known, vertices, traced):
+    faces = traced if known is None else known.faces
+    (value,) = call_on_host(_value_on_host, options, (_scalar(vertices),), vertices, faces)
+    return value
+
+
+def _penalty_forward(options, known, vertices, traced):
+    faces = traced if known is None else known.faces
+    results = (_scalar(vertices), (vertices.shape[-2:], vertices.dtype.name))
+    # The residual is the gradient: the backward pass never calls the host.
+    value, gradient = call_on_host(_value_and_gradient_on_host, options, results, vertices, faces)
+    return with_slope(vertices, value, gradient), gradient
+
+
+def _penalty_backward(options, known, gradient, cotangent):
+    return _scaled(gradient, cotangent), None
+
+
+_differentiable.defvjp(_penalty_forward, _penalty_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _differentiable_on_device(way, vertices, faces, tables):
+    return penalty_on_device(vertices, faces, Task(way[0], tables))[0]
+
+
+def _forward_on_device(way, vertices, faces, tables):
+    program, kind = way
+    task = Task(program._replace(gradient=kind), tables)
+    value, gradient = penalty_on_device(vertices, faces, task)
+    return with_slope(vertices, value, gradient), gradient
+
+
+def _backward_on_device(way, gradient, cotangent):
+    return _scaled(gradient, cotangent), None, None
+
+
+_differentiable_on_device.defvjp(_forward_on_device, _backward_on_device)
+_on_device = BoundedJit(_differentiable_on_device)
+
+
+def _scaled(gradient, cotangent):
+    # where, not a product alone: an infinite cotangent must not turn a zero gradient into NaN.
+    if is_local(gradient) and is_local(cotangent):  # nothing to compile
+        known = np.asarray(gradient)
+        with np.errstate(all="ignore"):
+            product = np.asarray(cotangent)[..., None, None] * known
+        return jax.device_put(np.where(known == 0, np.zeros_like(known), product))
+    product = cotangent[..., None, None] * gradient
+    return jnp.where(gradient == 0, jnp.zeros_like(product), product)
+
+
+def _scalar(vertices):
+    return (), vertices.dtype.name
+
+
+def _value_on_host(vertices, faces, options: _Options):
+    return _measure(vertices, faces, options, with_gradient=False)[:1]
+
+
+def _value_and_gradient_on_host(vertices, faces, options: _Options):
+    return _measure(vertices, faces, options, with_gradient=True)
+
+
+def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
+    nothing = np.zeros_like(vertices)
+    moved = None
+    try:
+        check_usable(vertices, faces, options.rounding)
+        if options.outwards and faces.size:
+            moved = Inflated(vertices, faces, options.outwards, options.rounding)
+            vertices = moved.vertices
+            check_usable(vertices, faces, options.rounding)
+        exact = options.sampling.rays is None
+        if exact and is_small_convex_solid(vertices, faces, options.rounding):
+            return np.zeros(()), nothing
+        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        if faces.size == 0:
+            return np.zeros(()), nothing
+        if options.value == "volume":
+            value = np.array(found.volume)
+        else:
+            value = np.mean(found.labels(options.rule) != 0)
+        gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
+        if moved is not None:
+            gradient = moved.pulled_back(gradient)
+    except Unmeasurable:
+        return np.array(np.nan), nothing
+    # Measured in float64: it may be more than the vertices' dtype can hold, or less.
+    narrow = options.rounding > np.finfo(np.float64).eps
+    held = np.finfo(np.float32 if narrow else np.float64)
+    if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
+        return np.array(np.nan), nothing
+    if options.value == "volume" and value < held.tiny:
+        # There is no overlap, but for rounding, or none that can be told from none: no slope.
+        return np.zeros(()), nothing
+    return value, gradient

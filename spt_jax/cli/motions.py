@@ -1,0 +1,197 @@
+"""Tracks of a pose file as the frames of one motion of a body, and back into files."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.cli.frames import Motion
+from spt_jax.io.pose_files import MotionFile, Track, choose, open_poses, write_poses
+
+if TYPE_CHECKING:
+    from spt_jax.body import BodyModel
+    from spt_jax.cli.frames import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """What of a pose file was asked for.
+
+    Attributes:
+        file: the file.
+        tracks: the people.
+        rows: of each of the frames asked for, which track and which of its frames it is.
+    """
+
+    file: MotionFile
+    tracks: tuple[Track, ...]
+    rows: tuple[tuple[int, int], ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Of the frames asked for."""
+        return [self.tracks[k].names[row] for k, row in self.rows]
+
+    @property
+    def num_shape(self) -> int:
+        """How many shape components the body should have."""
+        shapes = [track.shape.shape[-1] for track in self.tracks if track.shape is not None]
+        return max([10, *shapes])
+
+
+def chosen(path: Path, people: str, frames: str, max_bytes: int | None) -> Chosen:
+    """The people and frames asked for of a pose file.
+
+    Args:
+        path: the file.
+        people: "all", or names and numbers from 0, separated by commas.
+        frames: "all", or numbers from 0, ranges and names, separated by commas.
+        max_bytes: as in `load_poses`.
+
+    Raises:
+        ValueError, OSError: as `load_poses`; nobody or no frame of that name.
+    """
+    file = open_poses(path, max_bytes=max_bytes)
+    wanted = None if people == "all" else [one.strip() for one in people.split(",")]
+    tracks = tuple(choose(file, wanted))
+    places = [(k, row) for k, track in enumerate(tracks) for row in range(len(track.pose))]
+    rows = select_frames([tracks[k].names[row] for k, row in places], frames)
+    return Chosen(file, tracks, tuple(places[row] for row in rows))
+
+
+def select_frames(names: Sequence[str], wanted: str) -> list[int]:
+    """Rows of the frames asked for, in that order, each once; all of them for "all".
+
+    Raises:
+        ValueError: something that is neither a name, nor a row, nor a range of rows.
+    """
+    if wanted == "all":
+        return list(range(len(names)))
+    rows: list[int] = []
+    for item in map(str.strip, wanted.split(",")):
+        ends = re.fullmatch(r"(\d+)(?:-(\d+))?", item)
+        if item in names:
+            rows.append(names.index(item))
+            continue
+        first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
+        if not first <= last < len(names):
+            raise ValueError(
+                f"frames must be rows 0 to {len(names) - 1}, ranges of them or names such as "
+                f"{names[0]!r}: got {item!r}; separate several by commas."
+            )
+        rows += range(first, last + 1)
+    return list(dict.fromkeys(rows))
+
+
+def motion_of(asked: Chosen, model: "BodyModel", body: str) -> tuple[Motion, list[str]]:
+    """The frames asked for on the body, and what of them had to be left out."""
+    notes = list(asked.file.notes)
+    poses, lost = [], {}
+    for k, rows in _rows(asked):
+        track = asked.tracks[k]
+        pose = track.pose[rows]
+        turned = np.any(pose, axis=(0, 2)).tolist()
+        layout = SMPL_LAYOUTS[track.pose.shape[1]]
+        lost |= {
+            name: None
+            for name, used in zip(layout, turned, strict=True)
+            if used and name not in model.joint_names
+        }
+        poses.append(np.asarray(model.pose_from_smpl(pose.astype(np.float32))))
+    if lost:
+        shown = ", ".join(list(lost)[:4]) + (", ..." if len(lost) > 4 else "")
+        notes.append(f"the body lacks {shown}; their rotations are left out")
+    shape = _shapes(asked, model, body, notes)
+    shifts = [track.translation for track in asked.tracks]
+    translation = None
+    known = [shift for shift in shifts if shift is not None]
+    if len(known) == len(shifts):
+        translation = np.stack([known[k][row] for k, row in asked.rows]).astype(np.float32)
+    order = [(k, row) for k, rows in _rows(asked) for row in rows]
+    at = {place: number for number, place in enumerate(order)}
+    pose = np.concatenate(poses)[[at[place] for place in asked.rows]]
+    return Motion(asked.names, pose, shape, translation), notes
+
+
+def _rows(asked: Chosen) -> list[tuple[int, list[int]]]:
+    """The frames asked for of each track, in the order of the tracks."""
+    found: dict[int, list[int]] = {}
+    for k, row in asked.rows:
+        found.setdefault(k, []).append(row)
+    return sorted(found.items())
+
+
+def _shapes(asked: Chosen, model: "BodyModel", body: str, notes: list[str]) -> np.ndarray | None:
+    given = [track.shape for track in asked.tracks]
+    if all(shape is None for shape in given):
+        return None
+    if body == "anny":
+        notes.append(
+            "the file's shape is in SMPL's components, which the embedded body does not have; "
+            "its mean shape is used (--body takes an SMPL file)"
+        )
+        return None
+    widest = max(shape.shape[-1] for shape in given if shape is not None)
+    if widest > model.num_shape:
+        notes.append(f"shape components after the body's {model.num_shape} are left out")
+    shapes = np.zeros((len(asked.rows), min(widest, model.num_shape)), np.float32)
+    for at, (k, row) in enumerate(asked.rows):
+        one = given[k]
+        if one is not None:
+            values = (one if one.ndim == 1 else one[row])[: shapes.shape[1]]
+            shapes[at, : len(values)] = values
+    return shapes
+
+
+def write_motions(
+    folder: Path, done: Sequence["Frame"], motion: Motion, asked: Chosen
+) -> list[str]:
+    """Write the untangled poses in AMASS' layout, a file a person; return the files' names.
+
+    Shape, translation and gender come along, and the frame rate where the frames follow each other.
+    """
+    written = []
+    places = {place: k for k, place in enumerate(asked.rows)}
+    labels = [re.sub(r"[^\w.-]+", "_", track.name) or "person" for track in asked.tracks]
+    for k, rows in _rows(asked):
+        track, order = asked.tracks[k], [places[k, row] for row in rows]
+        label = labels[k] if labels.count(labels[k]) == 1 else f"{labels[k]}_{k}"
+        single = len(asked.file.tracks) == 1
+        written.append("poses.npz" if single else f"poses_{label}.npz")
+        follow = rows == list(range(rows[0], rows[0] + len(rows)))
+        write_poses(
+            folder / written[-1],
+            np.stack([done[at].pose for at in order]),
+            shape=None if motion.shape is None else motion.shape[order],
+            translation=None if motion.translation is None else motion.translation[order],
+            names=[motion.names[at] for at in order],
+            frame_rate=track.frame_rate if follow else None,
+            gender=track.gender,
+        )
+    return written
+
+
+def write_like_input(
+    folder: Path, done: Sequence["Frame"], motion: Motion, asked: Chosen, joints: Sequence[str]
+) -> tuple[str, tuple[str, ...]]:
+    """Write the input once more with the untangled poses; its name, and what does not fit them.
+
+    Rotations that did not change, joints that the body lacks, and frames and people that were not
+    asked for stand as they did.
+    """
+    poses = {track.name: track.pose.copy() for track in asked.tracks}
+    for at, (k, row) in enumerate(asked.rows):
+        track = asked.tracks[k]
+        layout = SMPL_LAYOUTS[track.pose.shape[1]]
+        for joint, name in enumerate(layout):
+            if name in joints:
+                of_body = joints.index(name)
+                if (done[at].pose[of_body] != motion.pose[at, of_body]).any():
+                    poses[track.name][row, joint] = done[at].pose[of_body]
+    path = asked.file.path
+    name = f"{path.stem}_untangled{path.suffix}"
+    return name, asked.file.write(folder / name, poses)

@@ -1,0 +1,156 @@
+"""`spt-jax untangle`: a pose file or a mesh file, freed of self-intersections."""
+
+import json as json_format
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from spt_jax.cli.mesh import untangle_mesh_file
+from spt_jax.cli.terminal import err_console, out_console, progress_bar, show, user_errors
+
+
+def untangle(
+    poses: tyro.conf.Positional[Path],
+    out: Path = Path("untangled"),
+    frames: str = "all",
+    people: str = "all",
+    body: str = "anny",
+    folds: Literal["ignore", "remove", "count"] = "ignore",
+    fold_distance: float | None = None,
+    meshes: bool = False,
+    like_input: bool = False,
+    rays: int | None = None,
+    anew: bool = False,
+    max_bytes: int | None = None,
+    json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Free the poses of a pose file from self-intersections, frame by frame, or one mesh file.
+
+    Takes the pose files of AMASS, SMPLify-X, PROX, HMR2, PHALP, WHAM, VIBE, PyMAF, GVHMR, TRAM,
+    ROMP, BEV, SLAHMR, BEDLAM, AIST++, 3DPW, MOYO, EasyMocap, MMHuman3D, Motion-X and VPoser, BVH,
+    and files that this command wrote; their suffixes do not matter. Writes poses.npz (AMASS layout,
+    in the body's joints; of several people one file each, poses_NAME.npz) and report.json. Each
+    frame that is done is kept in OUT/unfinished until all are: a run that was ended goes on with
+    the same command.
+
+    Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
+    in the same format; the exit code is 1 if something still intersects or overlaps.
+
+    Args:
+        poses: the pose file (.npz, .npy, .pkl, .pt, .json, .bvh), or a mesh file.
+        out: folder for the results, made where missing.
+        frames: which frames: numbers from 0, ranges and names, such as 0,5,10-12 or crawl/0012
+        people: whose frames, of a file of several: names or numbers from 0, such as 0,2
+        body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
+            (.npz, .pkl).
+        folds: of a posed body, what becomes of skin that folds where a joint bends: "ignore" leaves
+            it, "remove" frees the posed vertices of all that still crosses (only the meshes show
+            it, the poses do not), "count" takes folds for collisions. A line says how much is left
+            out.
+        fold_distance: how near to each other, along the skin at rest and in metres, what intersects
+            is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
+            0.04 on fingers.
+        meshes: write a .glb of each frame before and after, coloured by label.
+        like_input: write NAME_untangled too, the input in its own structure with the new poses.
+        rays: how many rays to cast along the longer side of each of three beams; the search uses
+            half as many; not given: none, everything is measured exactly.
+        anew: throw away what is done of an unfinished run in the folder.
+        max_bytes: how large an input file may be, and its arrays once unpacked; not given: 1 GiB.
+        json: print the report as JSON in place of the table.
+        quiet: print errors alone.
+    """
+    from spt_jax.io.pose_files import is_pose_file
+
+    if not is_pose_file(poses):
+        with user_errors():
+            _refuse_for_mesh(
+                frames=frames != "all",
+                people=people != "all",
+                like_input=like_input,
+                body=body != "anny",
+                folds=folds != "ignore",
+                fold_distance=fold_distance is not None,
+                anew=anew,
+            )
+        return untangle_mesh_file(
+            poses, out, meshes=meshes, rays=rays, max_bytes=max_bytes, json=json, quiet=quiet
+        )
+    from spt_jax._exclusions import as_fold_distance
+    from spt_jax._query import as_rays
+    from spt_jax.cli.motions import chosen, motion_of, write_like_input, write_motions
+    from spt_jax.files.outputs import ensure_folder, write_json
+
+    with user_errors():
+        as_rays(rays)
+        as_fold_distance(fold_distance)
+        asked = chosen(poses, people, frames, max_bytes)
+        folder = ensure_folder(out)
+    with progress_bar(len(asked.rows), quiet) as state:
+        state("loading the body")
+        from spt_jax.body import load_body
+        from spt_jax.cli.frames import (
+            as_report,
+            before_after_table,
+            left_out,
+            made_from,
+            summary,
+            untangle_frames,
+            write_meshes,
+        )
+        from spt_jax.cli.unfinished import UnfinishedRun, manifest_of
+
+        with user_errors():
+            model = load_body(body, num_shape=asked.num_shape, max_bytes=max_bytes)
+        motion, notes = motion_of(asked, model, body)
+        for note in notes:
+            show(err_console(quiet), f"note: {note}", "yellow")
+        options = {
+            "rays": rays,
+            "directions": 3,
+            "folds": folds,
+            "fold_distance": fold_distance,
+        }
+        with user_errors():
+            manifest = manifest_of(
+                "untangle", options | {"meshes": meshes}, model, made_from(motion)
+            )
+            run = UnfinishedRun(folder, manifest, say=partial(show, err_console(quiet)), anew=anew)
+        with run:
+            done = untangle_frames(
+                model, motion, **options, state=state, run=run, keep_vertices=meshes
+            )
+            state("writing", done=len(asked.rows))
+            report = as_report("untangle", done, {"poses": str(poses), "body": body, **options})
+            with user_errors():
+                written = write_meshes(folder, done, model.faces, (".glb",)) if meshes else []
+                report["meshes"] = written
+                report["structure"] = asked.file.structure
+                files = write_motions(folder, done, motion, asked)
+                if like_input:
+                    name, stale = write_like_input(folder, done, motion, asked, model.joint_names)
+                    files.append(name)
+                    for note in stale:
+                        show(err_console(quiet), f"note: {note}", "yellow")
+                    notes += stale
+                report["files"], report["notes"] = files, notes
+                write_json(folder / "report.json", report)
+                run.finish()
+    if json:
+        print(json_format.dumps(report, indent=2))
+        return 0
+    console = out_console(quiet)
+    console.print(before_after_table(done))
+    show(console, summary(done))
+    show(console, left_out((f.before for f in done), (f.after for f in done)))
+    also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
+    show(console, f"in {folder}: {', '.join(files)}, report.json{also}")
+    return 0
+
+
+def _refuse_for_mesh(**used: bool) -> None:
+    for name, given in used.items():
+        if given:
+            raise ValueError(f"{name} is for pose files: got it with a mesh; leave it out.")
