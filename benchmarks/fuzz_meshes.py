@@ -16,9 +16,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from spt_jax._penalty import _Options, _value_and_gradient_on_host
 from spt_jax._query import as_directions
 from spt_jax.overlap.exclusions import NOTHING
+from spt_jax.overlap.host_functions import PenaltyOptions, value_and_gradient_on_host
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 
 KINDS = ("general position", "contact", "coplanar", "duplicated", "sliver", "nested", "open")
@@ -98,10 +98,10 @@ def _broken_laws(value, gradient, points) -> list[str]:
 
 def _broken_as_returned(vertices, faces, dtype: str) -> list[str]:
     """What the penalty makes of it: in contact the sums have a slope from one side beside a 0."""
-    options = _Options(
+    options = PenaltyOptions(
         "volume", "boundary", "vertex", _SAMPLING, NOTHING, float(np.finfo(dtype).eps)
     )
-    value, gradient = _value_and_gradient_on_host(vertices, faces, options)
+    value, gradient = value_and_gradient_on_host(vertices, faces, options)
     if np.isnan(value) or value == 0:
         if np.any(gradient):
             return [f"the penalty is {value} with a gradient of {np.abs(gradient).max():.3g}"]

@@ -18,7 +18,7 @@ def clear_caches() -> None:
     What is kept is bounded whatever changes from call to call: the results of the last meshes
     (`config.result_cache_bytes`, 64 MB), what follows from the last lists of faces, tables of the
     last rest surfaces (50 MB each, at most four), the last 64 compiled calls of `backend="xla"`,
-    and the processes that share batches (190 MB each). This gives all of it back, together with
+    and the processes that share batches (100 MB each). This gives all of it back, together with
     JAX's own compiled programs, as `jax.clear_caches()` does. Everything is made again when it is
     next asked for: nothing that is returned changes.
 

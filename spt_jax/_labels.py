@@ -1,6 +1,6 @@
 """Which vertices lie in self-intersection: the paper's V_0, V_out and V_in (Algorithm 1)."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,9 +18,9 @@ from spt_jax._query import (
 from spt_jax._result import Result, plain
 from spt_jax.bridge.bounded_jit import BoundedJit
 from spt_jax.bridge.callback import call_on_host
-from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.host_functions import LabelOptions, labels_on_host
 from spt_jax.overlap.labels import CLEAR, INVERTED, PENETRATING
-from spt_jax.overlap.measure import Rule, Sampling, Unmeasurable, measure
+from spt_jax.overlap.measure import Rule, Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 from spt_jax.xla.backend import Program, Task, as_task, labels_on_device
@@ -153,17 +153,10 @@ def classify_vertices(
         task = as_task(program, sampling, vertices.dtype, exclusions)
         return VertexLabels(_on_device(program, vertices, jnp.asarray(faces), task.tables))
     rounding = float(np.finfo(vertices.dtype).eps)
-    options = _Options(rule, sampling, exclusions, rounding)
+    options = LabelOptions(rule, sampling, exclusions, rounding)
     results = ((vertices.shape[-2:-1], "int8"),)
-    (label,) = call_on_host(_labels_on_host, options, results, vertices, faces)
+    (label,) = call_on_host(labels_on_host, options, results, vertices, faces)
     return VertexLabels(label)
-
-
-class _Options(NamedTuple):
-    rule: Rule
-    sampling: Sampling
-    exclusions: Exclusions
-    rounding: float  # machine epsilon of the vertices
 
 
 def _labels_of(program, vertices, faces, tables):
@@ -171,11 +164,3 @@ def _labels_of(program, vertices, faces, tables):
 
 
 _on_device = BoundedJit(_labels_of)
-
-
-def _labels_on_host(vertices, faces, options: _Options):
-    try:
-        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
-        return (found.labels(options.rule),)
-    except Unmeasurable:
-        return (np.zeros(len(vertices), np.int8),)

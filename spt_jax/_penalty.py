@@ -23,18 +23,12 @@ from spt_jax._query import (
 from spt_jax.bridge.bounded_jit import BoundedJit
 from spt_jax.bridge.callback import call_on_host, is_local
 from spt_jax.bridge.reverse_only import refuse_forward, with_slope
-from spt_jax.overlap.convex import is_small_convex_solid
-from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.overlap.inflation import Inflated
-from spt_jax.overlap.measure import (
-    Gradient,
-    Rule,
-    Sampling,
-    Unmeasurable,
-    Value,
-    check_usable,
-    measure,
+from spt_jax.overlap.host_functions import (
+    PenaltyOptions,
+    value_and_gradient_on_host,
+    value_on_host,
 )
+from spt_jax.overlap.measure import Gradient, Rule, Sampling, Value
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 from spt_jax.xla.backend import Program, Task, as_task, penalty_on_device
@@ -153,7 +147,7 @@ def self_intersection_penalty(
     vertices = as_vertices(vertices)
     faces = as_faces(faces, vertices.shape[-2])
     apart = as_margin(margin)
-    options = _Options(
+    options = PenaltyOptions(
         as_choice("value", value, Value),
         as_choice("gradient", gradient, Gradient),
         as_choice("rule", rule, Rule),
@@ -225,16 +219,6 @@ def paper_penalty(
     )
 
 
-class _Options(NamedTuple):
-    value: Value
-    gradient: Gradient
-    rule: Rule
-    sampling: Sampling
-    exclusions: Exclusions
-    rounding: float  # machine epsilon of the vertices
-    outwards: float = 0.0  # how far the surface is moved before it is measured
-
-
 class _Known(NamedTuple):
     """Faces whose values are known: no operand, and nothing to differentiate."""
 
@@ -244,7 +228,7 @@ class _Known(NamedTuple):
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _differentiable(options, known, vertices, traced):
     faces = traced if known is None else known.faces
-    (value,) = call_on_host(_value_on_host, options, (_scalar(vertices),), vertices, faces)
+    (value,) = call_on_host(value_on_host, options, (_scalar(vertices),), vertices, faces)
     return value
 
 
@@ -252,7 +236,7 @@ def _penalty_forward(options, known, vertices, traced):
     faces = traced if known is None else known.faces
     results = (_scalar(vertices), (vertices.shape[-2:], vertices.dtype.name))
     # The residual is the gradient: the backward pass never calls the host.
-    value, gradient = call_on_host(_value_and_gradient_on_host, options, results, vertices, faces)
+    value, gradient = call_on_host(value_and_gradient_on_host, options, results, vertices, faces)
     return with_slope(vertices, value, gradient), gradient
 
 
@@ -296,46 +280,3 @@ def _scaled(gradient, cotangent):
 
 def _scalar(vertices):
     return (), vertices.dtype.name
-
-
-def _value_on_host(vertices, faces, options: _Options):
-    return _measure(vertices, faces, options, with_gradient=False)[:1]
-
-
-def _value_and_gradient_on_host(vertices, faces, options: _Options):
-    return _measure(vertices, faces, options, with_gradient=True)
-
-
-def _measure(vertices, faces, options: _Options, *, with_gradient: bool):
-    nothing = np.zeros_like(vertices)
-    moved = None
-    try:
-        check_usable(vertices, faces, options.rounding)
-        if options.outwards and faces.size:
-            moved = Inflated(vertices, faces, options.outwards, options.rounding)
-            vertices = moved.vertices
-            check_usable(vertices, faces, options.rounding)
-        exact = options.sampling.rays is None
-        if exact and is_small_convex_solid(vertices, faces, options.rounding):
-            return np.zeros(()), nothing
-        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
-        if faces.size == 0:
-            return np.zeros(()), nothing
-        if options.value == "volume":
-            value = np.array(found.volume)
-        else:
-            value = np.mean(found.labels(options.rule) != 0)
-        gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
-        if moved is not None:
-            gradient = moved.pulled_back(gradient)
-    except Unmeasurable:
-        return np.array(np.nan), nothing
-    # Measured in float64: it may be more than the vertices' dtype can hold, or less.
-    narrow = options.rounding > np.finfo(np.float64).eps
-    held = np.finfo(np.float32 if narrow else np.float64)
-    if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
-        return np.array(np.nan), nothing
-    if options.value == "volume" and value < held.tiny:
-        # There is no overlap, but for rounding, or none that can be told from none: no slope.
-        return np.zeros(()), nothing
-    return value, gradient

@@ -8,6 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Integer
 
+from spt_jax._known import check_indices
 from spt_jax.overlap.measure import Directions
 from spt_jax.overlap.rays.beam import Rays, orthogonal_directions
 from spt_jax.xla.settings import Xla
@@ -76,18 +77,6 @@ def as_faces(faces: Any, num_vertices: int) -> Integer[Array | np.ndarray, "F 3"
     known = np.asarray(faces)
     check_indices(known, num_vertices)
     return known
-
-
-def check_indices(faces: np.ndarray, num_vertices: int) -> None:
-    """Raise ValueError unless every index names a vertex."""
-    if faces.size == 0:
-        return
-    lowest, highest = int(faces.min()), int(faces.max())
-    if lowest < 0 or highest >= num_vertices:
-        raise ValueError(
-            f"faces must index into vertices: got index {lowest if lowest < 0 else highest} for "
-            f"{num_vertices} vertices; indices are 0-based."
-        )
 
 
 def as_rays(rays: Any) -> Rays:

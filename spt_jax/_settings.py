@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-_MOST_PROCESSES = 7  # not every core of a large machine: each takes 190 MB
+_MOST_PROCESSES = 7  # not every core of a large machine: each takes 100 MB
 _CACHE_BYTES = 64 << 20
 
 
@@ -16,8 +16,8 @@ class Config:
         processes: how many helper processes may share a batch of meshes on the host: 0 (the
             default), a number, or "auto" for one less than there are cores, at most 7. Two cores
             then measure a batch 1.7 times as fast as one. They are started once batches have taken
-            a second, take 190 MB each, and end with this process; a loss of one mesh at a time
-            gains nothing from them.
+            half a second, take 100 MB each (300 with a rest surface), and end with this process; a
+            loss of one mesh at a time gains nothing from them.
         result_cache_bytes: how much memory the results of the last meshes may take, 64 MB by
             default; 0 keeps none. A solver under `vmap` asks for the same meshes over and over.
 

@@ -25,9 +25,9 @@ import numpy as np
 from spt_jax._settings import config
 from spt_jax.bridge.worker import Function, LateError, LostError, Mesh, Worker, can_start, packed
 
-# Starting one takes a second of a core, and 190 MB while it is there: not before batches have
-# taken as long.
-_WORTH_STARTING = 1.0
+# Starting one takes a quarter of a second of a core, and 100 MB while it is there: not before
+# batches have taken longer.
+_WORTH_STARTING = 0.5
 
 # Triangles in a batch for it to be shared: handing a mesh over costs as much as some 500.
 _WORTH_SHARING = 10_000

@@ -66,7 +66,6 @@ class Worker:
     def __init__(self):
         ours, theirs = socket.socketpair()
         environment = os.environ | {
-            "JAX_PLATFORMS": "cpu",  # imported, never used; must not reserve an accelerator
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
             "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,

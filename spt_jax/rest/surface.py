@@ -4,17 +4,13 @@ import functools
 from typing import Any
 
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
-from spt_jax._query import check_indices
 from spt_jax.overlap.surface import parts_in_each_other
 from spt_jax.overlap.triangles.manifold import manifold_of
+from spt_jax.rest.arguments import Levels, as_distances, as_number, as_surface
 from spt_jax.rest.paths import MOST_PIECES, SurfacePaths, surface_paths
 from spt_jax.rest.thickness import local_radii
-
-# Distances of many faces are rounded down to so many steps of one ratio.
-_MOST_LEVELS = 32
 
 
 class RestSurface:
@@ -72,8 +68,8 @@ class RestSurface:
     _level: bytes
 
     def __init__(self, rest_vertices: Any, faces: Any, distance: Any = 0.3):
-        vertices, corners = _as_surface(rest_vertices, faces)
-        reach = _as_distances(distance, len(corners))
+        vertices, corners = as_surface(rest_vertices, faces)
+        reach = as_distances(distance, len(corners))
         paths = surface_paths(vertices, corners)
         if paths.pieces > MOST_PIECES:
             raise ValueError(
@@ -82,9 +78,7 @@ class RestSurface:
             )
         self._set(paths, reach, copies=1)
 
-    def _set(
-        self, paths: SurfacePaths, reach: tuple[tuple[float, ...], bytes], copies: int
-    ) -> None:
+    def _set(self, paths: SurfacePaths, reach: Levels, copies: int) -> None:
         # Set once, through object: what hashes must not change.
         values: dict[str, Any] = {"_paths": paths, "distance": max(reach[0]), "_copies": copies}
         values["_levels"], values["_level"] = reach
@@ -129,7 +123,7 @@ class RestSurface:
             >>> load_body().rest_surface.within(0.2)
             RestSurface(24540 faces, distance=0.2)
         """
-        return self._derived(_as_distances(distance, len(self._paths.faces)), self._copies)
+        return self._derived(as_distances(distance, len(self._paths.faces)), self._copies)
 
     def copies(self, count: int) -> "RestSurface":
         """The rest surface of `count` such meshes whose faces follow each other, as in a scene.
@@ -157,7 +151,7 @@ class RestSurface:
         step = len(self._paths.content.vertices)
         return all(np.array_equal(copy - k * step, own) for k, copy in enumerate(copies))
 
-    def _derived(self, reach, copies: int) -> "RestSurface":
+    def _derived(self, reach: Levels, copies: int) -> "RestSurface":
         other = object.__new__(RestSurface)
         other._set(self._paths, reach, copies)
         return other
@@ -280,8 +274,8 @@ def local_distances(rest_vertices: Any, faces: Any, girths: float = 0.8) -> Floa
         >>> RestSurface(torus.vertices, torus.faces, distance)
         RestSurface(2048 faces, distance=0.62 to 0.628)
     """
-    vertices, corners = _as_surface(rest_vertices, faces)
-    share = _as_number("girths", girths, "0.8 suits skinned bodies")
+    vertices, corners = as_surface(rest_vertices, faces)
+    share = as_number("girths", girths, "0.8 suits skinned bodies")
     radius = local_radii(vertices, corners, surface_paths(vertices, corners).graph)
     return 2 * np.pi * share * radius[corners].max(axis=1, initial=0.0)
 
@@ -292,74 +286,3 @@ def _rest_parts(content):
     of_face = np.zeros(len(content.faces), np.int64)
     of_face[manifold.beside] = manifold.part[manifold.faces[:, 0]]
     return of_face, parts_in_each_other(content.vertices, content.faces)
-
-
-def _as_surface(rest_vertices: Any, faces: Any):
-    for name, given in (("rest_vertices", rest_vertices), ("faces", faces)):
-        if isinstance(given, Tracer):
-            raise TypeError(
-                f"{name} must be known when traced: got a traced array; make the RestSurface (or "
-                "take body.rest_surface) outside jit, grad and vmap, and pass it in as an option."
-            )
-    vertices, corners = np.asarray(rest_vertices), np.asarray(faces)
-    if not np.issubdtype(vertices.dtype, np.floating):
-        raise TypeError(
-            f"rest_vertices must be floating-point: got {vertices.dtype}; convert them with "
-            "rest_vertices.astype('float32')."
-        )
-    if not np.issubdtype(corners.dtype, np.integer):
-        raise TypeError(f"faces must be whole numbers: got {corners.dtype}; use int32 indices.")
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(
-            f"rest_vertices must have shape (V, 3): got {vertices.shape}; a batch shares one rest "
-            "mesh."
-        )
-    if corners.ndim != 2 or corners.shape[1] != 3:
-        raise ValueError(f"faces must have shape (F, 3): got {corners.shape}; use triangles.")
-    if not np.isfinite(vertices).all():
-        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise ValueError(
-            f"rest_vertices must be finite: got {vertices[row].tolist()} in row {row}; drop or "
-            "repair such vertices."
-        )
-    check_indices(corners, len(vertices))
-    return vertices.astype(np.float64), corners.astype(np.int64)
-
-
-def _as_distances(distance: Any, count: int) -> tuple[tuple[float, ...], bytes]:
-    """The different distances, ascending, and which of them each face has, for hashing."""
-    if np.ndim(distance) == 0:
-        return (_as_number("distance", distance, "0.3 m suits a body"),), b""
-    if isinstance(distance, Tracer):
-        raise TypeError("distance must be known when traced: got a traced array; use NumPy.")
-    given = np.asarray(distance)
-    if given.dtype.kind not in "fiu" or given.shape != (count,):
-        raise ValueError(
-            f"distance must be a number or one for each of the {count} faces: got an array of "
-            f"{given.dtype} of shape {given.shape}."
-        )
-    given = given.astype(np.float64)
-    wrong = np.flatnonzero(~((given >= 0) & (given < np.inf)))
-    if len(wrong):
-        raise ValueError(
-            f"distance must be finite and not negative: got {given[wrong[0]]!r} for face "
-            f"{wrong[0]}; 0.3 m suits a body."
-        )
-    levels = np.unique(given)
-    if len(levels) > _MOST_LEVELS:
-        low = max(levels[levels > 0].min(), 1e-6 * levels[-1])
-        steps = np.geomspace(low, levels[-1], _MOST_LEVELS - 1)
-        levels = np.append(0.0, steps)
-        levels[-1] = given.max()
-    level = np.searchsorted(levels, given, side="right") - 1
-    used, level = np.unique(level, return_inverse=True)
-    kept = tuple(levels[used].tolist()) or (0.0,)
-    return kept, level.astype(np.uint8).tobytes() if len(kept) > 1 else b""
-
-
-def _as_number(name: str, value: Any, advice: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} must be a number: got {value!r}; pass a float, and {advice}.")
-    if not 0 <= value < np.inf:
-        raise ValueError(f"{name} must be finite and not negative: got {value!r}; {advice}.")
-    return float(value)

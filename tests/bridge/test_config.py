@@ -10,10 +10,10 @@ import pytest
 from helpers import join, sphere
 
 from spt_jax import config, self_intersection_penalty
-from spt_jax._penalty import _value_on_host
 from spt_jax._settings import Config
 from spt_jax.bridge import process_pool
 from spt_jax.bridge.result_cache import Recent
+from spt_jax.overlap.host_functions import value_on_host
 
 MESH = join(sphere(), sphere(center=(1.1, 0.2, 0.1)))
 
@@ -24,7 +24,7 @@ def test_a_loss_starts_no_processes_unless_told(monkeypatch):
     monkeypatch.setattr(process_pool, "_WORTH_STARTING", 0.0)
     monkeypatch.setattr(process_pool, "_WORTH_SHARING", 0)
     pool = process_pool.Workers()
-    work = process_pool.packed(_value_on_host, None)
+    work = process_pool.packed(value_on_host, None)
     assert config.processes == 0 and pool._ready(work, 3) == [] and pool._number == 0
     try:
         monkeypatch.setattr(config, "processes", 2)

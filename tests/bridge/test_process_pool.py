@@ -17,14 +17,14 @@ import pytest
 from helpers import join, sampling, sphere
 
 from spt_jax import config
-from spt_jax._penalty import _Options, _value_and_gradient_on_host
 from spt_jax.bridge import process_pool
 from spt_jax.bridge import worker as module
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
+from spt_jax.overlap.host_functions import PenaltyOptions, value_and_gradient_on_host
 from spt_jax.rest.surface import RestSurface
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
-OPTIONS = _Options("volume", "boundary", "vertex", sampling(None), NOTHING, 1e-7)
+OPTIONS = PenaltyOptions("volume", "boundary", "vertex", sampling(None), NOTHING, 1e-7)
 
 pytestmark = pytest.mark.skipif(not module.can_start(), reason="no workers on this system")
 
@@ -57,7 +57,7 @@ def batch(count=6):
 
 def until_ready(pool, options=OPTIONS):
     """Wait for the worker, as a solver would: by asking again."""
-    work = module.packed(_value_and_gradient_on_host, options)
+    work = module.packed(value_and_gradient_on_host, options)
     for _ in range(2000):
         if ready := pool._ready(work, 1):
             pool._release(ready[0])
@@ -79,9 +79,9 @@ def count_answers(worker, monkeypatch):
 
 
 def check(pool, executor, meshes, options=OPTIONS):
-    found = pool.measure(_value_and_gradient_on_host, options, meshes, lambda: executor)
+    found = pool.measure(value_and_gradient_on_host, options, meshes, lambda: executor)
     for mesh, (value, gradient) in zip(meshes, found, strict=True):
-        expected = _value_and_gradient_on_host(*mesh, options)
+        expected = value_and_gradient_on_host(*mesh, options)
         assert value == expected[0] > 0
         np.testing.assert_array_equal(gradient, expected[1])
 
@@ -101,6 +101,9 @@ def test_same_bits_as_here_with_new_faces_and_options(pool, executor, monkeypatc
     before = len(answers)
     check(pool, executor, batch(), folds)
     assert len(answers) > before
+    loaded = Path(f"/proc/{pool._free[0]._process.pid}/maps")
+    if loaded.exists():  # a worker has no use for JAX, and does not wait for its import
+        assert "umath" in loaded.read_text() and "jaxlib" not in loaded.read_text()
 
 
 @pytest.mark.slow
@@ -210,8 +213,8 @@ def test_a_single_mesh_is_not_kept_waiting_either(pool, executor, monkeypatch):
     worker._process.send_signal(signal.SIGSTOP)
     pool._at_work = 1  # as if another thread were measuring
     (mesh,) = batch(1)
-    value, _ = pool.measure_one(_value_and_gradient_on_host, OPTIONS, mesh)
-    assert value == _value_and_gradient_on_host(*mesh, OPTIONS)[0]
+    value, _ = pool.measure_one(value_and_gradient_on_host, OPTIONS, mesh)
+    assert value == value_and_gradient_on_host(*mesh, OPTIONS)[0]
     assert pool._free == [worker] and worker._awaited
 
 
@@ -242,14 +245,14 @@ def test_patience_is_some_times_what_is_usual():
 
 
 def kind_of(mesh):
-    return module.packed(_value_and_gradient_on_host, OPTIONS), len(mesh[1])
+    return module.packed(value_and_gradient_on_host, OPTIONS), len(mesh[1])
 
 
 def test_errors_are_raised_here_and_leave_no_worker_busy(pool, executor):
     until_ready(pool)
     meshes = [(None, batch()[0][1]), *batch()]
     with pytest.raises(TypeError):
-        pool.measure(_value_and_gradient_on_host, OPTIONS, meshes, lambda: executor)
+        pool.measure(value_and_gradient_on_host, OPTIONS, meshes, lambda: executor)
     check(pool, executor, batch())
 
 

@@ -92,7 +92,8 @@ def test_imports_run_downwards(above):
             assert not [other for other in others if floor(other) in APART.get(above, ())], name
 
 
-def test_overlap_is_imported_without_jax():
-    code = "import sys, spt_jax.overlap.measure; print({'jax', 'optimistix'} & set(sys.modules))"
+def test_the_measure_and_all_that_workers_run_are_imported_without_jax():
+    modules = "spt_jax.overlap.host_functions, spt_jax.rest.surface, spt_jax.bridge.worker"
+    code = f"import sys, {modules}; print({{'jax', 'optimistix'}} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "set()", done.stdout + done.stderr

@@ -1,0 +1,115 @@
+"""What JAX asks the host for: functions of one mesh that never raise, NumPy and SciPy alone.
+
+They stand here, and not beside the public functions that call them, because other processes run
+them as well (`bridge/worker.py`): a worker that imports no JAX starts in a third of the time and
+takes half of the memory.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, Int8
+
+from spt_jax.overlap.convex import is_small_convex_solid
+from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.inflation import Inflated
+from spt_jax.overlap.measure import (
+    Gradient,
+    Rule,
+    Sampling,
+    Unmeasurable,
+    Value,
+    check_usable,
+    measure,
+)
+
+Vertices = Float[np.ndarray, "V 3"]
+Faces = Int[np.ndarray, "F 3"]
+
+
+class PenaltyOptions(NamedTuple):
+    """What the penalty is asked for, checked, hashable, and known to other processes.
+
+    Attributes:
+        value, gradient, rule, sampling, exclusions: as the arguments of
+            `self_intersection_penalty`.
+        rounding: machine epsilon of the vertices as the caller has them.
+        outwards: how far the surface is moved along its normals before it is measured.
+    """
+
+    value: Value
+    gradient: Gradient
+    rule: Rule
+    sampling: Sampling
+    exclusions: Exclusions
+    rounding: float
+    outwards: float = 0.0
+
+
+class LabelOptions(NamedTuple):
+    """What the labels are asked for; see `PenaltyOptions`."""
+
+    rule: Rule
+    sampling: Sampling
+    exclusions: Exclusions
+    rounding: float
+
+
+def value_on_host(
+    vertices: Vertices, faces: Faces, options: PenaltyOptions
+) -> tuple[Float[np.ndarray, ""], ...]:
+    """The penalty alone; NaN where the mesh cannot be measured."""
+    return _measured(vertices, faces, options, with_gradient=False)[:1]
+
+
+def value_and_gradient_on_host(
+    vertices: Vertices, faces: Faces, options: PenaltyOptions
+) -> tuple[Float[np.ndarray, ""], Float[np.ndarray, "V 3"]]:
+    """The penalty and its gradient; NaN and zeros where the mesh cannot be measured."""
+    return _measured(vertices, faces, options, with_gradient=True)
+
+
+def labels_on_host(
+    vertices: Vertices, faces: Faces, options: LabelOptions
+) -> tuple[Int8[np.ndarray, "V"]]:
+    """The label of each vertex; all are clear where the mesh cannot be measured."""
+    try:
+        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        return (found.labels(options.rule),)
+    except Unmeasurable:
+        return (np.zeros(len(vertices), np.int8),)
+
+
+def _measured(vertices, faces, options: PenaltyOptions, *, with_gradient: bool):
+    nothing = np.zeros_like(vertices)
+    moved = None
+    try:
+        check_usable(vertices, faces, options.rounding)
+        if options.outwards and faces.size:
+            moved = Inflated(vertices, faces, options.outwards, options.rounding)
+            vertices = moved.vertices
+            check_usable(vertices, faces, options.rounding)
+        exact = options.sampling.rays is None
+        if exact and is_small_convex_solid(vertices, faces, options.rounding):
+            return np.zeros(()), nothing
+        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        if faces.size == 0:
+            return np.zeros(()), nothing
+        if options.value == "volume":
+            value = np.array(found.volume)
+        else:
+            value = np.mean(found.labels(options.rule) != 0)
+        gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
+        if moved is not None:
+            gradient = moved.pulled_back(gradient)
+    except Unmeasurable:
+        return np.array(np.nan), nothing
+    # Measured in float64: it may be more than the vertices' dtype can hold, or less.
+    narrow = options.rounding > np.finfo(np.float64).eps
+    held = np.finfo(np.float32 if narrow else np.float64)
+    if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
+        return np.array(np.nan), nothing
+    if options.value == "volume" and value < held.tiny:
+        # There is no overlap, but for rounding, or none that can be told from none: no slope.
+        return np.zeros(()), nothing
+    return value, gradient
