@@ -98,7 +98,7 @@ def _measured(vertices, faces, options: PenaltyOptions, *, with_gradient: bool):
         if options.value == "volume":
             value = np.array(found.volume)
         else:
-            value = np.mean(found.labels(options.rule) != 0)
+            value = np.array(np.mean(found.labels(options.rule) != 0))
         gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
         if moved is not None:
             gradient = moved.pulled_back(gradient)
