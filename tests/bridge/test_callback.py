@@ -14,12 +14,12 @@ import pytest
 from helpers import join, sphere
 
 from spt_jax import (
-    _penalty,
     classify_vertices,
     config,
     self_intersection_penalty,
 )
 from spt_jax.bridge import callback, on_host, process_pool
+from spt_jax.overlap import host_functions
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -115,7 +115,7 @@ def test_too_little_memory_is_nan_and_no_crash(monkeypatch):
     def hungry(*_):
         raise MemoryError
 
-    monkeypatch.setattr(_penalty, "measure", hungry)
+    monkeypatch.setattr(host_functions, "measure", hungry)
     vertices, faces = join(sphere(subdivisions=1), sphere(subdivisions=1))
     step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=31))
     value, gradient = step(jnp.asarray(vertices, "float32"))
