@@ -16,6 +16,10 @@ from spt_jax.body.poses import SMPL_LAYOUTS
 _BODY_PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
 
 
+_LEGS = [6, 7, 8, 9, 6, 11, 12, 13]
+_BACK_LEGS = [0, 17, 18, 19, 0, 21, 22, 23]
+
+
 def _finger_parents(left, right, first):
     parents = []
     for wrist in (left, right):
@@ -24,7 +28,13 @@ def _finger_parents(left, right, first):
     return parents
 
 
+# MANO, FLAME, SMAL with and without ears, SUPR (of whose tree the tests need nothing but a tree).
 PARENTS = {
+    16: [-1, *(parent for first in range(1, 16, 3) for parent in (0, first, first + 1))],
+    5: [-1, 0, 1, 1, 1],
+    33: [-1, *range(6), *_LEGS, 6, 15, *_BACK_LEGS, 0, *range(25, 31), 16],
+    35: [-1, *range(6), *_LEGS, 6, 15, *_BACK_LEGS, 0, *range(25, 31), 16, 16, 16],
+    75: [-1, *(k // 2 for k in range(74))],
     24: [*_BODY_PARENTS, 20, 21],
     52: [*_BODY_PARENTS, *_finger_parents(20, 21, 22)],
     55: [*_BODY_PARENTS, 15, 15, 15, *_finger_parents(20, 21, 25)],
@@ -50,13 +60,13 @@ def slow_body(smpl, pose, shape, translation, keep=slice(None)):
     shapedirs = np.asarray(smpl["shapedirs"], np.float64)[..., : len(shape)]
     v_shaped = smpl["v_template"] + shapedirs @ shape
     if "J_regressor" in smpl:
-        joints = smpl["J_regressor"] @ v_shaped
+        joints = slow_joints(smpl["J_regressor"], v_shaped)
     else:
         joints = smpl["J"] + np.asarray(smpl["J_shapedirs"], np.float64) @ shape
     rotations = [slow_rotation(row) for row in np.asarray(pose, np.float64)]
     v_posed = v_shaped
     if smpl.get("posedirs") is not None:
-        feature = np.concatenate([(r - np.eye(3)).ravel() for r in rotations[1:]])
+        feature = slow_features(smpl["posedirs"].shape[-1], pose, rotations, shape)
         v_posed = v_shaped + smpl["posedirs"] @ feature
 
     world = []
@@ -76,7 +86,28 @@ def slow_body(smpl, pose, shape, translation, keep=slice(None)):
     return np.array(posed), np.array([w[:3, 3] for w in world]) + translation
 
 
-def synthetic_smpl(rng, joints=24, vertices=60, components=10):
+def slow_joints(regressor, points):
+    """SMPL's regressor, or SUPR's, which takes all coordinates in one row and a constant."""
+    if regressor.shape[1] == len(points):
+        return regressor @ points
+    return (regressor @ np.append(points.ravel(), 1.0)).reshape(-1, 3)
+
+
+def slow_features(columns, pose, rotations, shape):
+    """What pose blend shapes go by: SMPL's equation 8, STAR's equation 5 or SUPR's equation 6."""
+    if columns == 9 * (len(pose) - 1):
+        return np.concatenate([(r - np.eye(3)).ravel() for r in rotations[1:]])
+    quaternions = []
+    for row in np.asarray(pose, np.float64):
+        angle = np.linalg.norm(row)
+        axis = row / angle if angle else row
+        quaternions.append([*np.sin(angle / 2) * axis, np.cos(angle / 2) - 1])
+    if columns == 4 * len(pose):
+        return np.ravel(quaternions)
+    return np.append(np.ravel(quaternions[1:]), shape[1] if len(shape) > 1 else 0.0)
+
+
+def synthetic_smpl(rng, joints=24, vertices=60, components=10, features=None):
     """Arrays with the keys, shapes and dtypes of a file of the SMPL family, and random numbers."""
     parents = PARENTS[joints]
     weights = rng.random((vertices, joints)) * (rng.random((vertices, joints)) < 0.2)
@@ -87,11 +118,20 @@ def synthetic_smpl(rng, joints=24, vertices=60, components=10):
     return {
         "v_template": rng.normal(size=(vertices, 3)),
         "shapedirs": 0.1 * rng.normal(size=(vertices, 3, components)),
-        "posedirs": 0.05 * rng.normal(size=(vertices, 3, 9 * (joints - 1))),
+        "posedirs": 0.05 * rng.normal(size=(vertices, 3, features or 9 * (joints - 1))),
         "J_regressor": regressor / regressor.sum(axis=1, keepdims=True),
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "kintree_table": table,
         "f": rng.integers(0, vertices, (2 * vertices, 3)).astype(np.uint32),
+    }
+
+
+def synthetic_hand(rng, names=("",)):
+    """Hand components and mean poses, as MANO's files have them, or SMPL-H's and SMPL-X's."""
+    return {
+        f"hands_{kind}{name}": 0.3 * rng.normal(size=shape)
+        for name in names
+        for kind, shape in (("components", (45, 45)), ("mean", (45,)))
     }
 
 

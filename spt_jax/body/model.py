@@ -1,10 +1,10 @@
 """The body model: shape and pose in, vertices and joints out."""
 
-from functools import partial
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -13,15 +13,10 @@ from jaxtyping import Array, DTypeLike, Float, Int
 from spt_jax._groups import Pairs, neighbour_pairs, part_groups
 from spt_jax.body import poses
 from spt_jax.body.fold_distances import fold_distances
+from spt_jax.body.hands import Hand, posed_hands
 from spt_jax.body.model_check import check_model
-from spt_jax.body.rotations import matrix_from_axis_angle
-from spt_jax.body.skinning import (
-    blend_shapes,
-    displacement,
-    forward_kinematics,
-    lift,
-    linear_blend_skinning,
-)
+from spt_jax.body.posing import PoseFeatures, pose_body
+from spt_jax.body.skinning import blend_shapes
 from spt_jax.rest.surface import RestSurface
 
 
@@ -56,6 +51,13 @@ class BodyModel(eqx.Module):
         joint_names: one name for each joint.
         pose_basis: pose blend shapes, the coefficients row by row through R_1 - I to R_J-1 - I; or
             None.
+        expression_basis: displacement of each vertex for one unit of each expression coefficient
+            (SMPL-X, FLAME), added as the shape's is; or None.
+        joint_expression_basis: the same of the joints.
+        hands: the hand components of the model (MANO, SMPL-H, SMPL-X), for `with_hands`.
+        pose_features: what `pose_basis` goes by: "matrices", as above; "quaternions", (x, y, z,
+            w - 1) of every joint (SUPR); "star", those of all joints but the root and then the
+            second shape coefficient (STAR).
 
     Raises:
         TypeError: an array has the wrong kind of dtype.
@@ -80,6 +82,10 @@ class BodyModel(eqx.Module):
     parents: tuple[int, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
     pose_basis: Float[Array, "V 3 P"] | None = None
+    expression_basis: Float[Array, "V 3 E"] | None = None
+    joint_expression_basis: Float[Array, "J 3 E"] | None = None
+    hands: tuple[Hand, ...] = ()
+    pose_features: PoseFeatures = eqx.field(static=True, default="matrices")
 
     def __check_init__(self):
         check_model(self)
@@ -98,6 +104,11 @@ class BodyModel(eqx.Module):
     def num_shape(self) -> int:
         """Number of shape coefficients."""
         return self.shape_basis.shape[-1]
+
+    @property
+    def num_expression(self) -> int:
+        """Number of expression coefficients."""
+        return 0 if self.expression_basis is None else self.expression_basis.shape[-1]
 
     @property
     def rest_surface(self) -> RestSurface:
@@ -159,6 +170,8 @@ class BodyModel(eqx.Module):
         pose: Float[Array | np.ndarray, "*#batch J 3"],
         shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
         translation: Float[Array | np.ndarray, "*#batch 3"] | None = None,
+        *,
+        expression: Float[Array | np.ndarray, "*#batch E"] | None = None,
     ) -> PosedBody:
         """The body's vertices and joints in a pose.
 
@@ -170,6 +183,8 @@ class BodyModel(eqx.Module):
             shape: coefficients of the first components of the shape basis; fewer than the body
                 has leave the rest at zero, and None means the mean shape.
             translation: added to vertices and joints, in metres; None means zero.
+            expression: coefficients of the first components of the expression basis; None means
+                a face at rest.
 
         Any number of leading batch axes, which broadcast against each other.
 
@@ -198,7 +213,8 @@ class BodyModel(eqx.Module):
                 f"{tuple(angles.shape)}; for SMPL's layouts use body.pose_from_smpl(pose)."
             )
         dtype = angles.dtype
-        betas = None if shape is None else self._coefficients(shape, dtype)
+        betas = None if shape is None else self._coefficients("shape", shape, dtype)
+        face = None if expression is None else self._coefficients("expression", expression, dtype)
         shift = None if translation is None else _floating("translation", translation).astype(dtype)
         if shift is not None and (shift.ndim < 1 or shift.shape[-1] != 3):
             raise ValueError(f"translation must be (..., 3): got shape {tuple(shift.shape)}.")
@@ -206,9 +222,9 @@ class BodyModel(eqx.Module):
             pose=angles.shape[:-2],
             shape=() if betas is None else betas.shape[:-1],
             translation=() if shift is None else shift.shape[:-1],
+            expression=() if face is None else face.shape[:-1],
         )
-
-        return _pose(self, angles, betas, shift, batch_rank=len(batch))
+        return PosedBody(*pose_body(self, angles, betas, face, shift, batch_rank=len(batch)))
 
     def rest(
         self, shape: Float[Array | np.ndarray, "*batch B"] | None = None
@@ -232,7 +248,7 @@ class BodyModel(eqx.Module):
         """
         if shape is None:
             return self.template
-        betas = self._coefficients(shape, None)
+        betas = self._coefficients("shape", shape, None)
         return blend_shapes(self.template, self.shape_basis, betas, betas.dtype)
 
     def pose_from_smpl(self, pose: Float[Array | np.ndarray, "..."]) -> Float[Array, "*batch J 3"]:
@@ -300,51 +316,71 @@ class BodyModel(eqx.Module):
                 f"indices must be from 0 to {self.num_vertices - 1}, one for each vertex: got "
                 f"{worst}; indices are 0-based."
             )
-        return BodyModel(
-            template=self.template[rows],
-            shape_basis=self.shape_basis[rows],
-            joint_template=self.joint_template,
-            joint_shape_basis=self.joint_shape_basis,
-            weights=self.weights[rows],
-            faces=jnp.zeros((0, 3), jnp.int32),
-            parents=self.parents,
-            joint_names=self.joint_names,
-            pose_basis=None if self.pose_basis is None else self.pose_basis[rows],
-        )
+        own = {
+            name: None if array is None else array[rows]
+            for name in ("template", "shape_basis", "weights", "pose_basis", "expression_basis")
+            for array in [getattr(self, name)]
+        }
+        return self.replaced({**own, "faces": jnp.zeros((0, 3), jnp.int32)})
 
-    def _coefficients(self, shape, dtype: DTypeLike | None) -> Float[Array, "*batch B"]:
-        betas = _floating("shape", shape)
-        if betas.ndim < 1 or betas.shape[-1] > self.num_shape:
+    def replaced(self, values: Mapping[str, Any]) -> "BodyModel":
+        """The same body with other values of some attributes, by name; checked as a new one is."""
+        return dataclasses.replace(self, **values)
+
+    def with_hands(
+        self,
+        pose: Float[Array | np.ndarray, "*#batch J 3"],
+        left: Float[Array | np.ndarray, "*#batch K"] | None = None,
+        right: Float[Array | np.ndarray, "*#batch L"] | None = None,
+        *,
+        flat: bool = False,
+    ) -> Float[Array, "..."]:
+        """A pose with its fingers as hand components say, in place of their rows in `pose`.
+
+        A hand's 15 rotations are its mean plus coefficients times components (Romero et al. 2017,
+        "Embodied Hands"), as the package smplx has it with `use_pca`. Pose files hold 6 to 45 of
+        them (`load_poses` gives them as `left_hand` and `right_hand`).
+
+        Args:
+            pose: axis-angle, (..., J, 3).
+            left, right: coefficients of the first components; None leaves that hand as it is. A
+                MANO file has one hand.
+            flat: leave the mean out, as smplx does with `flat_hand_mean=True`.
+
+        Returns:
+            The pose, in its dtype; batch axes broadcast.
+
+        Raises:
+            TypeError: an argument is not floating-point.
+            ValueError: the body has no components of that hand, or fewer.
+
+        Differentiation: every mode; the map is affine.
+
+        Example:
+            >>> import jax.numpy as jnp
+            >>> from spt_jax.body import BodyModel, Hand, load_body
+            >>> body = load_body()  # which has none of its own
+            >>> joints = tuple(range(22, 37))
+            >>> curl = jnp.zeros((1, 15, 3)).at[..., 2].set(-0.5).reshape(1, 45)
+            >>> hand = Hand("left", joints, curl, jnp.zeros(45))
+            >>> pose = body.replaced({"hands": (hand,)}).with_hands(
+            ...     jnp.zeros((52, 3)), left=jnp.array([2.0])
+            ... )
+            >>> pose[22].tolist(), pose[37].tolist()
+            ([0.0, 0.0, -1.0], [0.0, 0.0, 0.0])
+        """
+        return posed_hands(self.hands, _floating("pose", pose), left, right, flat)
+
+    def _coefficients(self, name: str, given, dtype: DTypeLike | None) -> Float[Array, "*batch B"]:
+        betas = _floating(name, given)
+        most = self.num_shape if name == "shape" else self.num_expression
+        if betas.ndim < 1 or betas.shape[-1] > most:
             raise ValueError(
-                f"shape must have at most {self.num_shape} coefficients in its last axis: got "
+                f"{name} must have at most {most} coefficients in its last axis: got "
                 f"shape {tuple(betas.shape)}; drop the last ones, or load the body with a larger "
-                "num_shape where its file has them."
+                f"num_{name} where its file has them."
             )
         return betas if dtype is None else betas.astype(dtype)
-
-
-# Compiled here as well as by the caller: outside jit that is one compilation, not one for each of
-# 200 small operations (a first call of 1.5 s, not 4 s).
-@partial(jax.jit, static_argnames="batch_rank")
-def _pose(body: BodyModel, angles, betas, shift, batch_rank: int) -> PosedBody:
-    dtype = angles.dtype
-    # Equal ranks from the start: jax_numpy_rank_promotion="raise" is respected.
-    rotations = lift(matrix_from_axis_angle(angles), batch_rank, 3)
-    vertices = lift(blend_shapes(body.template, body.shape_basis, betas, dtype), batch_rank, 2)
-    joints = blend_shapes(body.joint_template, body.joint_shape_basis, betas, dtype)
-    joints = lift(joints, batch_rank, 2)
-    if body.pose_basis is not None:
-        eye = jnp.eye(3, dtype=dtype).reshape((1,) * (batch_rank + 1) + (3, 3))
-        bend = rotations[..., 1:, :, :] - eye
-        bend = bend.reshape(*bend.shape[:-3], 9 * (body.num_joints - 1))
-        vertices = vertices + displacement(body.pose_basis, bend)
-    world, positions = forward_kinematics(rotations, joints, body.parents)
-    weights = body.weights.astype(dtype)
-    vertices = linear_blend_skinning(vertices, weights, world, positions, joints)
-    if shift is not None:
-        shift = lift(shift, batch_rank, 1)[..., None, :]
-        vertices, positions = vertices + shift, positions + shift
-    return PosedBody(vertices, positions)
 
 
 def _floating(name: str, value) -> Float[Array, "..."]:

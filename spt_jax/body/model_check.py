@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from spt_jax.body.posing import POSE_FEATURES, count_features
+
 if TYPE_CHECKING:
     from spt_jax.body.model import BodyModel
 
@@ -15,13 +17,25 @@ def check_model(body: "BodyModel") -> None:
     vertices = body.template.shape[0] if body.template.ndim else 0
     joints = body.joint_template.shape[0] if body.joint_template.ndim else 0
     coefficients = body.shape_basis.shape[-1] if body.shape_basis.ndim else 0
+    if body.pose_features not in POSE_FEATURES:
+        raise ValueError(
+            f"pose_features must be one of {', '.join(map(repr, POSE_FEATURES))}: got "
+            f"{body.pose_features!r}."
+        )
+    if (body.expression_basis is None) != (body.joint_expression_basis is None):
+        raise ValueError(
+            "expression_basis and joint_expression_basis must be given together: got one of them."
+        )
+    expressions = 0 if body.expression_basis is None else body.expression_basis.shape[-1]
     expected = {
         "template": (vertices, 3),
         "shape_basis": (vertices, 3, coefficients),
         "joint_template": (joints, 3),
         "joint_shape_basis": (joints, 3, coefficients),
         "weights": (vertices, joints),
-        "pose_basis": (vertices, 3, 9 * (joints - 1)),
+        "pose_basis": (vertices, 3, count_features(body.pose_features, max(joints, 1))),
+        "expression_basis": (vertices, 3, expressions),
+        "joint_expression_basis": (joints, 3, expressions),
     }
     for name, shape in expected.items():
         array = getattr(body, name)
@@ -48,6 +62,12 @@ def check_model(body: "BodyModel") -> None:
             raise ValueError(
                 "parents must be -1 for joint 0 and an earlier joint for every other: got "
                 f"{parent} for joint {joint} ({body.joint_names[joint]}); reorder the joints."
+            )
+    for hand in body.hands:
+        if not all(0 <= joint < joints for joint in hand.joints):
+            raise ValueError(
+                f"the joints of the {hand.side} hand must be among the body's {joints}: got "
+                f"{hand.joints}."
             )
     if not isinstance(body.faces, Tracer) and body.faces.size:
         low, high = int(np.min(body.faces)), int(np.max(body.faces))

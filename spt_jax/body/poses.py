@@ -10,7 +10,7 @@ _BODY = (
     *("left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
     *("left_elbow", "right_elbow", "left_wrist", "right_wrist"),
 )
-_FINGERS = tuple(
+FINGERS = tuple(
     f"{side}_{finger}{knuckle}"
     for side in ("left", "right")
     for finger in ("index", "middle", "pinky", "ring", "thumb")
@@ -21,8 +21,8 @@ _FINGERS = tuple(
 SMPL_LAYOUTS: dict[int, tuple[str, ...]] = {
     22: _BODY,
     24: (*_BODY, "left_hand", "right_hand"),
-    52: (*_BODY, *_FINGERS),
-    55: (*_BODY, "jaw", "left_eye", "right_eye", *_FINGERS),
+    52: (*_BODY, *FINGERS),
+    55: (*_BODY, "jaw", "left_eye", "right_eye", *FINGERS),
 }
 
 

@@ -70,6 +70,34 @@ def matrix_from_axis_angle(axis_angle: Float[Array, "*batch 3"]) -> Float[Array,
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion_from_axis_angle(axis_angle: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4"]:
+    """Unit quaternions (w, x, y, z) of axis-angle vectors: cos(t/2), and sin(t/2)/t times them.
+
+    Args:
+        axis_angle: rotation axis times angle, in radians; any number of leading batch axes.
+
+    Returns:
+        Quaternions; w is negative beyond half a turn.
+
+    Differentiation: every mode and order; value and derivatives are finite and exact at zero.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax.body.rotations import quaternion_from_axis_angle
+        >>> quaternion_from_axis_angle(jnp.array([jnp.pi, 0.0, 0.0])).round(6).tolist()
+        [-0.0, 1.0, 0.0, 0.0]
+    """
+    half = 0.5 * axis_angle
+    squared = jnp.sum(half * half, axis=-1, keepdims=True)
+    small = squared < _SERIES_BELOW
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    near = jnp.where(small, squared, 0.0)
+    sine = jnp.where(small, _polynomial(_SINC, near), jnp.sin(angle) / angle)
+    # cos(a) = 1 - a^2 (1 - cos(a)) / a^2: the series is at hand.
+    cosine = jnp.where(small, 1.0 - near * _polynomial(_COSC, near), jnp.cos(angle))
+    return jnp.concatenate([cosine, sine * half], axis=-1)
+
+
 def axis_angle_from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
     """Axis-angle vectors of rotation matrices, the angle between 0 and pi.
 

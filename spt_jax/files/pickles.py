@@ -415,6 +415,8 @@ def read_pickle(path: str | os.PathLike[str], content: bytes | None = None) -> d
             f"{os.fspath(path)} cannot be read as a pickle: {type(error).__name__}: {error}; it "
             "is truncated or damaged: download it again."
         ) from error
+    if isinstance(value, np.ndarray) and value.dtype.hasobject and value.shape == ():
+        value = value.item()  # as np.save wraps a dictionary
     if not isinstance(value, dict):
         raise ValueError(
             f"{os.fspath(path)} must hold a dictionary of arrays: got {type(value).__name__}."

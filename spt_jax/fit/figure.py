@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from spt_jax.body import BodyModel
+from spt_jax.body.posing import feature_columns
 from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.body.skinning import (
     blend_shapes,
@@ -101,7 +102,7 @@ def make_figure(body: BodyModel, regressor: KeypointRegressor) -> Figure:
     dtype = body.weights.dtype
     basis = few.pose_basis
     if basis is not None:
-        columns = (9 * (moving[1:, None] - 1) + np.arange(9)).reshape(-1)
+        columns = feature_columns(body.pose_features, moving, body.num_joints)
         basis = jnp.asarray(np.asarray(basis)[..., columns])
     smaller = BodyModel(
         template=few.template,
@@ -116,6 +117,7 @@ def make_figure(body: BodyModel, regressor: KeypointRegressor) -> Figure:
         ),
         joint_names=tuple(body.joint_names[joint] for joint in moving),
         pose_basis=basis,
+        pose_features=body.pose_features,
     )
     points = KeypointRegressor(
         names=regressor.names,
