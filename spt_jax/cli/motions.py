@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -101,7 +101,8 @@ def motion_of(asked: Chosen, model: "BodyModel", body: str) -> tuple[Motion, lis
             for name, used in zip(layout, turned, strict=True)
             if used and name not in model.joint_names
         }
-        poses.append(np.asarray(model.pose_from_smpl(pose.astype(np.float32))))
+        posed = model.pose_from_smpl(pose.astype(np.float32))
+        poses.append(_with_hands(model, posed, track, rows, notes))
     if lost:
         shown = ", ".join(list(lost)[:4]) + (", ..." if len(lost) > 4 else "")
         notes.append(f"the body lacks {shown}; their rotations are left out")
@@ -115,6 +116,26 @@ def motion_of(asked: Chosen, model: "BodyModel", body: str) -> tuple[Motion, lis
     at = {place: number for number, place in enumerate(order)}
     pose = np.concatenate(poses)[[at[place] for place in asked.rows]]
     return Motion(asked.names, pose, shape, translation), notes
+
+
+def _with_hands(
+    model: "BodyModel", pose: Any, track: Track, rows: list[int], notes: list[str]
+) -> np.ndarray:
+    """The pose with the fingers that the file has as components of hands."""
+    known = {hand.side: len(hand.components) for hand in model.hands}
+    used: dict[str, np.ndarray] = {}
+    for side, given in (("left", track.left_hand), ("right", track.right_hand)):
+        if given is None:
+            continue
+        if given.shape[1] <= known.get(side, 0):
+            used[side] = given[rows].astype(np.float32)
+            continue
+        what = f"{known[side]} components" if side in known else "no components"
+        notes.append(
+            f"the body has {what} of the {side} hand, the file {given.shape[1]}: those fingers are "
+            "at rest"
+        )
+    return np.asarray(model.with_hands(pose, **used))
 
 
 def _rows(asked: Chosen) -> list[tuple[int, list[int]]]:
@@ -194,4 +215,24 @@ def write_like_input(
                     poses[track.name][row, joint] = done[at].pose[of_body]
     path = asked.file.path
     name = f"{path.stem}_untangled{path.suffix}"
-    return name, asked.file.write(folder / name, poses)
+    stale = asked.file.write(folder / name, poses)
+    return name, (*stale, *_hands_as_given(name, done, motion, asked, joints))
+
+
+def _hands_as_given(
+    name: str, done: Sequence["Frame"], motion: Motion, asked: Chosen, joints: Sequence[str]
+) -> list[str]:
+    """What to say of hands that are components in the file and whose fingers were moved."""
+    said = []
+    for side in ("left", "right"):
+        own = [k for k, joint in enumerate(joints) if joint.startswith(side) and joint[-1] in "123"]
+        of_side = [getattr(track, f"{side}_hand") is not None for track in asked.tracks]
+        if any(
+            of_side[k] and (done[at].pose[own] != motion.pose[at, own]).any()
+            for at, (k, _) in enumerate(asked.rows)
+        ):
+            said.append(
+                f"{name} keeps the components of the {side} hand as they were: how its fingers "
+                "were moved stands in the poses that are written beside it"
+            )
+    return said

@@ -118,9 +118,7 @@ def test_what_a_file_is_stands_in_its_refusal(tmp_path, rng):
     refused("got 24 joints and 90 components in posedirs", **synthetic_smpl(rng, features=90))
     smpl = synthetic_smpl(rng, 5, 9)
     refused("with 0 of them", **smpl, **synthetic_hand(rng))
-    refused(
-        r"hands_components in .*any, 45.*\(45, 9\)", **smpl, hands_components=np.zeros((45, 9))
-    )
+    refused(r"hands_components in .*any, 45.*\(45, 9\)", **smpl, hands_components=np.zeros((45, 9)))
     tree = smpl["kintree_table"].copy()
     tree[0, 2] = 3
     refused("left_eye as the parent of jaw", **(smpl | {"kintree_table": tree}))

@@ -5,6 +5,7 @@ import json
 import helpers_poses as made
 import numpy as np
 import pytest
+from helpers_body import synthetic_hand, synthetic_smpl
 from helpers_poses import MADE, as_matrix
 from test_cli import calls as calls  # the fixture
 from test_cli import files_in
@@ -134,3 +135,19 @@ def test_a_pickled_body_model_is_still_a_body(tmp_path, rng):
     (tmp_path / "model.pkl").write_bytes(pickle.dumps(model, protocol=2))
     opened = files.open_file(tmp_path / "model.pkl")
     assert isinstance(opened, Scene) and opened.body is not None
+
+
+def test_hand_components_drive_the_fingers_of_a_body_that_has_some(calls, tmp_path, capsys, rng):
+    smpl = synthetic_smpl(rng, 55, 30) | synthetic_hand(rng, ("l", "r"))
+    smpl["hands_componentsl"] = smpl["hands_componentsl"][:6]  # fewer than the file has
+    np.savez(tmp_path / "model.npz", **smpl)
+    file = written(tmp_path, "smplifyx")
+    words = ["untangle", str(file), "--out", str(tmp_path / "out"), "--rays", "16"]
+    assert main([*words, "--body", str(tmp_path / "model.npz"), "--like-input"]) == 0
+    fingers = np.asarray(calls[0]["pose"])[25:]
+    want = smpl["hands_meanr"] + smpl["hands_componentsr"][:12].sum(axis=0)
+    np.testing.assert_allclose(fingers[15:].ravel(), want, rtol=1e-5, atol=1e-6)
+    assert not fingers[:15].any()
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the body has 6 components of the left hand, the file 12" in said
+    assert "keeps the components of the right hand as they were" in said

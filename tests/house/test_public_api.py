@@ -70,7 +70,7 @@ PARAMETERS = {
     " margin=0.002, fold_distance=None, max_steps=25, **options",
     "keypoint_regressor": "body, layout, *, count=None, names=None",
     "read_keypoints": "path, *, layout=None, max_bytes=None",
-    "load_body": "source='anny', *, num_shape=10, dtype=None, max_bytes=None",
+    "load_body": "source='anny', *, num_shape=10, num_expression=10, dtype=None, max_bytes=None",
     "load_mocap": "",
     "untangle_motion": "body, poses, *, shape=None, translation=None, frames_per_second=30.0,"
     " fade=0.05, fold_distance=None, margin=0.002, feet=1.0, up=(0.0, 1.0, 0.0), tolerance=1e-09,"

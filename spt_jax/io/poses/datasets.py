@@ -205,8 +205,8 @@ def _easymocap_track(source: Source, at: Way) -> Track:
             "right_hand": values[:, ends + hand : ends + 2 * hand],
         }
         source.note(
-            f"poses has {hand} components of each of MANO's hands, whose basis the file does not "
-            "have: fingers are at rest"
+            f"poses has {hand} components of each of MANO's hands, which a body that has hand "
+            "components turns into rotations"
         )
     person = source.get((*at, "id"))
     source.used.add((*at, "id"))

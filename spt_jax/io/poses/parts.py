@@ -155,8 +155,8 @@ def _components(source: Source, way: Way, index: tuple[Any, ...], side: str) -> 
             f"of a hand: got shape {values.shape} in {source.file!r}"
         )
     source.note(
-        f"{spelt(way)} is {values.shape[1]} components of MANO's hand, whose basis the file does "
-        "not have: those fingers are at rest"
+        f"{spelt(way)} is {values.shape[1]} components of MANO's hand, which a body that has "
+        "hand components turns into rotations"
     )
     return values
 

@@ -38,7 +38,8 @@ class Track:
         names: one a frame.
         frames: the numbers that the file gives them.
         left_hand, right_hand: components of MANO's hands, where the file has these in place of
-            rotations; the fingers of `pose` are at rest then.
+            rotations; the fingers of `pose` are at rest then, and
+            `body.with_hands(body.pose_from_smpl(pose), left_hand, right_hand)` has them.
         expression: coefficients of the face.
         blocks: where in the file the rotations stand.
         copies: where they stand once more, turned as a whole or not.
