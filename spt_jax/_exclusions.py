@@ -71,7 +71,7 @@ def as_fold_surface(body: Any, fold_distance: Any) -> RestSurface:
     """The rest surface that decides what folds: the body's own, or with one distance everywhere.
 
     Args:
-        body: a `BodyModel`.
+        body: a `BodyModel`, or another with a `rest_surface`.
         fold_distance: in metres; None for the body's own distances, place by place.
 
     Raises:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,24 +10,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from spt_jax._groups import Pairs, neighbour_pairs, part_groups
-from spt_jax.body import poses
+from spt_jax.body.base import AbstractBody, PosedBody, broadcast_batches, floating
 from spt_jax.body.fold_distances import fold_distances
 from spt_jax.body.hands import Hand, posed_hands
-from spt_jax.body.model_check import check_model
+from spt_jax.body.model_check import check_model, checked_rows
 from spt_jax.body.posing import PoseFeatures, pose_body
 from spt_jax.body.skinning import blend_shapes
 from spt_jax.rest.surface import RestSurface
 
 
-class PosedBody(NamedTuple):
-    """A body in a pose: `vertices` (..., V, 3) and `joints` (..., J, 3), in metres."""
-
-    vertices: Float[Array, "*batch V 3"]
-    joints: Float[Array, "*batch J 3"]
-
-
-class BodyModel(eqx.Module):
+class BodyModel(AbstractBody):
     """A statistical body of the SMPL family: blend shapes, a tree of joints, linear blend skinning.
 
     With shape b, joint rotations R_j relative to the parents and the tree's world motions G_j
@@ -136,35 +128,6 @@ class BodyModel(eqx.Module):
         allowed = fold_distances(template, faces, weights, joints, self.parents)
         return RestSurface(self.template, self.faces, allowed)
 
-    @property
-    def part_groups(self) -> Int[np.ndarray, "F"]:
-        """Of each face, the joint that moves it most (`joint_names` says which).
-
-        By the mean skinning weight over its corners. With `ignore_groups=body.neighbour_pairs`,
-        overlaps of parts that meet at a joint do not count.
-
-        Raises:
-            TypeError: as `rest_surface`.
-
-        Example:
-            >>> from spt_jax.body import load_body
-            >>> body = load_body()
-            >>> body.joint_names[body.part_groups[body.template[body.faces[:, 0], 1].argmax()]]
-            'head'
-        """
-        return part_groups(self.weights, self.faces)
-
-    @property
-    def neighbour_pairs(self) -> Pairs:
-        """Each part with itself and with its parent's, as pairs of joints for `ignore_groups`.
-
-        Example:
-            >>> from spt_jax.body import load_body
-            >>> (4, 7) in load_body().neighbour_pairs  # left knee, left ankle
-            True
-        """
-        return neighbour_pairs(self.parents)
-
     def __call__(
         self,
         pose: Float[Array | np.ndarray, "*#batch J 3"],
@@ -206,7 +169,7 @@ class BodyModel(eqx.Module):
             >>> body(jnp.zeros((52, 3)), two_shapes).vertices.shape
             (2, 12272, 3)
         """
-        angles = _floating("pose", pose)
+        angles = floating("pose", pose)
         if angles.ndim < 2 or angles.shape[-2:] != (self.num_joints, 3):
             raise ValueError(
                 f"pose must be (..., {self.num_joints}, 3), one axis-angle row a joint: got shape "
@@ -215,10 +178,10 @@ class BodyModel(eqx.Module):
         dtype = angles.dtype
         betas = None if shape is None else self._coefficients("shape", shape, dtype)
         face = None if expression is None else self._coefficients("expression", expression, dtype)
-        shift = None if translation is None else _floating("translation", translation).astype(dtype)
+        shift = None if translation is None else floating("translation", translation).astype(dtype)
         if shift is not None and (shift.ndim < 1 or shift.shape[-1] != 3):
             raise ValueError(f"translation must be (..., 3): got shape {tuple(shift.shape)}.")
-        batch = _broadcast_batches(
+        batch = broadcast_batches(
             pose=angles.shape[:-2],
             shape=() if betas is None else betas.shape[:-1],
             translation=() if shift is None else shift.shape[:-1],
@@ -251,32 +214,6 @@ class BodyModel(eqx.Module):
         betas = self._coefficients("shape", shape, None)
         return blend_shapes(self.template, self.shape_basis, betas, betas.dtype)
 
-    def pose_from_smpl(self, pose: Float[Array | np.ndarray, "..."]) -> Float[Array, "*batch J 3"]:
-        """This body's pose from a pose of 22, 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints.
-
-        Rotations are copied by joint name. Joints that the pose lacks stay at rest; joints that
-        this body lacks are dropped: on the embedded body SMPL-X's jaw and eyes and SMPL's two
-        lumped hand joints.
-
-        Args:
-            pose: axis-angle, in radians, as (..., joints, 3) or flat as (..., 3 * joints).
-
-        Returns:
-            A pose for this body, in the dtype of `pose`.
-
-        Raises:
-            TypeError, ValueError: `pose` is not floating-point, or has none of those shapes.
-        Differentiation: every mode; the map is linear.
-
-        Example:
-            >>> import jax.numpy as jnp
-            >>> from spt_jax.body import load_body
-            >>> body = load_body()
-            >>> body.pose_from_smpl(jnp.zeros((8, 72))).shape
-            (8, 52, 3)
-        """
-        return poses.pose_from_smpl(pose, self.joint_names)
-
     def at_vertices(self, indices: Any) -> "BodyModel":
         """The same body with some of its vertices only, and no faces.
 
@@ -301,21 +238,7 @@ class BodyModel(eqx.Module):
             >>> tip(jnp.zeros((52, 3))).vertices.shape
             (1, 3)
         """
-        if isinstance(indices, Tracer):
-            raise TypeError("indices must be known when traced: got a traced array.")
-        rows = np.asarray(indices)
-        if rows.size == 0:
-            rows = rows.astype(np.int32)
-        if not np.issubdtype(rows.dtype, np.integer):
-            raise TypeError(f"indices must be whole numbers: got dtype {rows.dtype}.")
-        if rows.ndim != 1:
-            raise ValueError(f"indices must be a list of vertices: got shape {rows.shape}.")
-        if rows.size and (rows.min() < 0 or rows.max() >= self.num_vertices):
-            worst = int(rows.min() if rows.min() < 0 else rows.max())
-            raise ValueError(
-                f"indices must be from 0 to {self.num_vertices - 1}, one for each vertex: got "
-                f"{worst}; indices are 0-based."
-            )
+        rows = checked_rows(indices, self.num_vertices)
         own = {
             name: None if array is None else array[rows]
             for name in ("template", "shape_basis", "weights", "pose_basis", "expression_basis")
@@ -369,10 +292,10 @@ class BodyModel(eqx.Module):
             >>> pose[22].tolist(), pose[37].tolist()
             ([0.0, 0.0, -1.0], [0.0, 0.0, 0.0])
         """
-        return posed_hands(self.hands, _floating("pose", pose), left, right, flat)
+        return posed_hands(self.hands, floating("pose", pose), left, right, flat)
 
     def _coefficients(self, name: str, given, dtype: DTypeLike | None) -> Float[Array, "*batch B"]:
-        betas = _floating(name, given)
+        betas = floating(name, given)
         most = self.num_shape if name == "shape" else self.num_expression
         if betas.ndim < 1 or betas.shape[-1] > most:
             raise ValueError(
@@ -381,23 +304,3 @@ class BodyModel(eqx.Module):
                 f"num_{name} where its file has them."
             )
         return betas if dtype is None else betas.astype(dtype)
-
-
-def _floating(name: str, value) -> Float[Array, "..."]:
-    array = jnp.asarray(value)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        raise TypeError(
-            f"{name} must be floating-point: got dtype {array.dtype}; "
-            f"convert it with {name}.astype('float32')."
-        )
-    return array
-
-
-def _broadcast_batches(**batches: tuple[int, ...]) -> tuple[int, ...]:
-    try:
-        return jnp.broadcast_shapes(*batches.values())
-    except ValueError as error:
-        seen = ", ".join(f"{name} {batch}" for name, batch in batches.items())
-        raise ValueError(
-            f"batch axes must broadcast against each other: got {seen}; make them equal or 1."
-        ) from error

@@ -150,7 +150,7 @@ def manifest_of(
     Args:
         command: its name.
         settings: the options that change a result.
-        body: the `BodyModel`.
+        body: the `BodyModel` or `RigModel`.
         items: the name of each and what it is made from: arrays, strings, numbers, None.
     """
     import jax

@@ -17,17 +17,26 @@ if typing.TYPE_CHECKING:
     from spt_jax.io.pose_files import open_poses as open_poses
     from spt_jax.io.pose_files import read_poses as read_poses
     from spt_jax.io.pose_files import write_poses as write_poses
+    from spt_jax.io.rigs.clips import Clip as Clip
+    from spt_jax.io.rigs.exporting import write_rig as write_rig
+    from spt_jax.io.rigs.reading import RigFile as RigFile
+    from spt_jax.io.rigs.reading import load_rig as load_rig
+    from spt_jax.io.rigs.reading import load_rigs as load_rigs
     from spt_jax.keypoints.files import KeypointFile as KeypointFile
     from spt_jax.keypoints.files import read_keypoints as read_keypoints
 
 __all__ = [
+    "Clip",
     "KeypointFile",
     "MeshFile",
     "MotionFile",
     "RefusedPickleError",
+    "RigFile",
     "Track",
     "load_body",
     "load_poses",
+    "load_rig",
+    "load_rigs",
     "open_mesh",
     "open_poses",
     "read_keypoints",
@@ -35,6 +44,7 @@ __all__ = [
     "read_poses",
     "write_mesh",
     "write_poses",
+    "write_rig",
 ]
 
 __getattr__, __dir__ = _lazy_names(
@@ -52,6 +62,11 @@ __getattr__, __dir__ = _lazy_names(
         "open_poses": "spt_jax.io.pose_files",
         "read_poses": "spt_jax.io.pose_files",
         "write_poses": "spt_jax.io.pose_files",
+        "Clip": "spt_jax.io.rigs.clips",
+        "write_rig": "spt_jax.io.rigs.exporting",
+        "RigFile": "spt_jax.io.rigs.reading",
+        "load_rig": "spt_jax.io.rigs.reading",
+        "load_rigs": "spt_jax.io.rigs.reading",
         "KeypointFile": "spt_jax.keypoints.files",
         "read_keypoints": "spt_jax.keypoints.files",
     },

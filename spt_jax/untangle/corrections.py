@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax._geometry import inflate
 from spt_jax._penalty import self_intersection_penalty
-from spt_jax.body import BodyModel
+from spt_jax.body import AbstractBody
 from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from spt_jax.rest.surface import RestSurface
 from spt_jax.untangle.descent import CENTIMETRE, STIFFNESS
@@ -79,13 +79,7 @@ def as_given(
 @eqx.filter_jit
 def _displacement_forms(body, frames: Frames, stride: int, feet, standing):
     """For each frame the quadratic form: turns -> mean squared displacement."""
-    chosen = eqx.tree_at(
-        lambda b: (b.template, b.shape_basis, b.weights),
-        body,
-        (body.template[::stride], body.shape_basis[::stride], body.weights[::stride]),
-    )
-    if body.pose_basis is not None:
-        chosen = eqx.tree_at(lambda b: b.pose_basis, chosen, body.pose_basis[::stride])
+    chosen = body.at_vertices(np.arange(0, body.num_vertices, stride))
     feet = feet[:, ::stride]
     size = jnp.maximum(feet.sum(axis=1), 1.0)
 
@@ -101,7 +95,7 @@ def _displacement_forms(body, frames: Frames, stride: int, feet, standing):
 
 
 def displacement_factor(
-    body: BodyModel,
+    body: AbstractBody,
     frames: Frames,
     feet: Bool[np.ndarray, "K V"],
     standing: Float[np.ndarray, "T K"],
@@ -161,7 +155,7 @@ class Corrections(NamedTuple):
     A vector's squared length is the mean squared displacement in cm^2, to first order.
     """
 
-    body: BodyModel
+    body: AbstractBody
     rest: RestSurface | None
     frames: Frames
     factor: Float[np.ndarray, "N N"]

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax._penalty import self_intersection_penalty
 from spt_jax._status import RESULTS
-from spt_jax.body import BodyModel
+from spt_jax.body import AbstractBody
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
@@ -96,7 +96,7 @@ def vertices_of(body, pose, shape, translation) -> Float[Array, "V 3"]:
     return body(pose, shape, translation).vertices
 
 
-def faces_of(body: BodyModel) -> Int[np.ndarray, "F 3"]:
+def faces_of(body: AbstractBody) -> Int[np.ndarray, "F 3"]:
     """A body's faces as the host takes them."""
     return np.asarray(body.faces, np.int64)
 
@@ -104,21 +104,24 @@ def faces_of(body: BodyModel) -> Int[np.ndarray, "F 3"]:
 @eqx.filter_jit
 def displacement_factor(body, pose, shape):
     """Cholesky factor of the quadratic form: joint rotations -> mean squared displacement."""
-    jacobian = jax.jacfwd(lambda joints: body(pose.at[1:].set(joints), shape).vertices)(pose[1:])
-    jacobian = jacobian.reshape(-1, pose[1:].size)
+    free = body.free_rows
+    given = pose[free]
+    jacobian = jax.jacfwd(lambda rows: body(pose.at[free].set(rows), shape).vertices)(given)
+    jacobian = jacobian.reshape(-1, given.size)
     form = jacobian.T @ jacobian / body.num_vertices
     return jnp.linalg.cholesky(form + STIFFNESS * jnp.eye(len(form), dtype=form.dtype))
 
 
-def turned(pose, factor, moved):
+def turned(body, pose, factor, moved):
     """The pose whose linearised displacement, in centimetres, has the squared norm of `moved`."""
     turn = jax.scipy.linalg.solve_triangular(factor, moved, trans=1, lower=True)
-    return pose.at[1:].add(CENTIMETRE * turn.reshape(pose[1:].shape))
+    free = body.free_rows
+    return pose.at[free].add(CENTIMETRE * turn.reshape(pose[free].shape))
 
 
 def _objective(search: Search, moved, arguments):
     body, (pose, shape, translation, factor), margin, weight = arguments
-    vertices = body(turned(pose, factor, moved), shape, translation).vertices
+    vertices = body(turned(body, pose, factor, moved), shape, translation).vertices
     volume = self_intersection_penalty(
         vertices,
         body.faces,
@@ -224,5 +227,5 @@ def _one_step(search: Search, arguments, moved, state):
     moved, state, _ = search.solver.step(y=moved, state=state, **solving)
     done, result = search.solver.terminate(y=moved, state=state, **solving)
     body, (pose, shape, translation, factor), _, _ = arguments
-    at = turned(pose, factor, moved)
+    at = turned(body, pose, factor, moved)
     return moved, state, done, result, at, body(at, shape, translation).vertices

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from spt_jax.body import BodyModel
+from spt_jax.body import AbstractBody
 from spt_jax.untangle.corrections import Frames
 
 # A foot stands no higher than this above the ground, in metres, and no faster, in metres a second.
@@ -30,7 +30,7 @@ class Standing(NamedTuple):
 
 
 def standing_feet(
-    body: BodyModel,
+    body: AbstractBody,
     frames: Frames,
     frames_per_second: float,
     up: Float[np.ndarray, "3"],
@@ -67,7 +67,7 @@ def standing_feet(
     return Standing(feet, low.astype(np.float64))
 
 
-def feet_of(body: BodyModel) -> Bool[np.ndarray, "K V"]:
+def feet_of(body: AbstractBody) -> Bool[np.ndarray, "K V"]:
     """Which vertices each foot's joints move more than all others."""
     found = []
     for name in _ANKLES:

@@ -13,7 +13,7 @@ from spt_jax._exclusions import as_fold_surface
 from spt_jax._query import as_margin
 from spt_jax._result import Result, plain
 from spt_jax._status import RESULTS, in_words, names_of
-from spt_jax.body import BodyModel
+from spt_jax.body import AbstractBody
 from spt_jax.metrics import MotionOverlap
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.untangle.corrections import Corrections, Frames, displacement_factor
@@ -90,7 +90,7 @@ class MotionResult(Result):
 
 
 def untangle_motion(
-    body: BodyModel,
+    body: AbstractBody,
     poses: Float[Array, "T J 3"] | Float[np.ndarray, "T J 3"],
     *,
     shape: Float[Array, "*T B"] | Float[np.ndarray, "*T B"] | None = None,
@@ -119,7 +119,7 @@ def untangle_motion(
     armpits, elbows and groins, are left as they are.
 
     Args:
-        body: any `BodyModel`.
+        body: a `BodyModel`, a `RigModel`, or what `spt_jax.body.adapt` makes of a body with joints.
         poses: axis-angle of each frame, in radians.
         shape: shape coefficients, one vector or one a frame; held fixed.
         translation: in metres, one vector or one a frame; held fixed.
@@ -223,7 +223,7 @@ def _after(body, frames: Frames, pose, moved, before: MotionOverlap, exclusions)
     return before.with_frames(at, found)
 
 
-def _as_frames(body: BodyModel, poses: Any, shape: Any, translation: Any) -> Frames:
+def _as_frames(body: AbstractBody, poses: Any, shape: Any, translation: Any) -> Frames:
     if isinstance(poses, Tracer):
         raise TypeError(
             "poses must be known: got a traced array; untangle_motion decides by the values that "

@@ -13,7 +13,7 @@ from spt_jax._exclusions import as_fold_surface
 from spt_jax._query import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax._result import Overlap, Result, plain
 from spt_jax._status import RESULTS, in_words, names_of
-from spt_jax.body import BodyModel
+from spt_jax.body import AbstractBody
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.untangle.descent import (
@@ -83,7 +83,7 @@ class UntangleResult(Result):
 
 
 def untangle_pose(
-    body: BodyModel,
+    body: AbstractBody,
     pose: Float[Array, "*batch J 3"] | Float[np.ndarray, "*batch J 3"],
     *,
     shape: Float[Array, "*#batch B"] | Float[np.ndarray, "*#batch B"] | None = None,
@@ -112,7 +112,7 @@ def untangle_pose(
     weights leave collisions, the last ones are tried again with two and four times the margin.
 
     Args:
-        body: any `BodyModel`.
+        body: a `BodyModel`, a `RigModel`, or what `spt_jax.body.adapt` returns.
         pose: axis-angle, radians; leading axes are solved one after another.
         shape: shape coefficients, held fixed.
         translation: in metres, held fixed.
@@ -168,9 +168,10 @@ def untangle_pose(
         'collision-free'
     """
     pose = jnp.asarray(pose)
-    if pose.shape[-2:] != (body.num_joints, 3):
+    one = body.pose_shape
+    if pose.shape[-len(one) :] != one:
         raise ValueError(
-            f"pose must have shape (..., {body.num_joints}, 3): got {pose.shape}; "
+            f"pose must have shape (..., {', '.join(map(str, one))}): got {pose.shape}; "
             "body.pose_from_smpl converts poses of other joint counts."
         )
     if isinstance(pose, Tracer):
@@ -190,7 +191,7 @@ def untangle_pose(
         raise ValueError(
             f"steps_per_weight must be a positive whole number: got {steps_per_weight!r}."
         )
-    batch = pose.shape[:-2]
+    batch = pose.shape[: pose.ndim - len(one)]
     for name, array in (("shape", shape), ("translation", translation)):
         if array is not None and not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite: got {np.asarray(array)!r}.")
@@ -207,7 +208,7 @@ def untangle_pose(
         solver=solver or SOLVER,
         rest=rest,
     )
-    poses = pose.reshape(-1, *pose.shape[-2:])
+    poses = pose.reshape(-1, *one)
     shapes = _per_pose("shape", shape, batch, len(poses))
     translations = _per_pose("translation", translation, batch, len(poses))
     surface = Surface(np.asarray(body.faces), body.num_vertices) if way == "remove" else None
@@ -235,7 +236,7 @@ def _as_search_rays(rays: Any) -> Rays:
 def _untangle_one(
     search: Search,
     surface: Surface | None,
-    body: BodyModel,
+    body: AbstractBody,
     pose: Array,
     shape: Array | None,
     translation: Array | None,
@@ -263,7 +264,7 @@ def _untangle_one(
             else:
                 there, taken, ended = descend_in_steps(*arguments, stage, steps, on_step)
             steps += int(taken)
-            candidate = turned(pose, factor, there)
+            candidate = turned(body, pose, factor, there)
             found = _measured(search, body, pose, candidate, shape, translation)
             if found is None:
                 diverged = True

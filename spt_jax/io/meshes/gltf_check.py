@@ -59,16 +59,7 @@ def check_gltf(tree: dict[str, Any], path: Path, max_bytes: int | None) -> None:
         UnreadableError: a feature that changes the shape and is not read; a file that is missing.
         ValueError, KeyError, TypeError, IndexError: its JSON is none of glTF's.
     """
-    unknown = [
-        name
-        for name in tree.get("extensionsRequired", ())
-        if name not in _SHAPE and not str(name).startswith(_LOOKS)
-    ]
-    if unknown:
-        raise UnreadableError(f"it needs {', '.join(map(str, unknown))}; export it without")
-    for node in tree.get("nodes", ()):
-        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
-            raise UnreadableError("it has instances by EXT_mesh_gpu_instancing; export it without")
+    check_extensions(tree)
     views = tree.get("bufferViews", [])
     total = 0
     for accessor in tree.get("accessors", ()):
@@ -91,6 +82,39 @@ def check_gltf(tree: dict[str, Any], path: Path, max_bytes: int | None) -> None:
             if accessor.get("normalized"):
                 raise UnreadableError("its positions are normalized whole numbers; export floats")
     _check_buffers(tree, path, max_bytes)
+
+
+def check_extensions(tree: dict[str, Any]) -> None:
+    """Raise where a glTF needs an extension that is not read.
+
+    Raises:
+        UnreadableError: it does.
+    """
+    unknown = [
+        name
+        for name in tree.get("extensionsRequired", ())
+        if name not in _SHAPE and not str(name).startswith(_LOOKS)
+    ]
+    if unknown:
+        raise UnreadableError(f"it needs {', '.join(map(str, unknown))}; export it without")
+    for node in tree.get("nodes", ()):
+        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
+            raise UnreadableError("it has instances by EXT_mesh_gpu_instancing; export it without")
+
+
+def file_of_uri(uri: str, folder: Path, what: str) -> Path:
+    """The file beside a glTF that a URI names.
+
+    Raises:
+        UnreadableError: it is missing, or lies anywhere else.
+    """
+    inside = folder.resolve()
+    file = (inside / unquote(uri)).resolve()
+    if "://" in uri or not file.is_relative_to(inside):
+        raise UnreadableError(f"{what} must lie beside it: got {uri[:80]!r}")
+    if not file.is_file():
+        raise UnreadableError(f"{what} is missing: {uri[:80]!r}; put it beside it")
+    return file
 
 
 def primitives(tree: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -125,7 +149,7 @@ def gltf_extras(tree: dict[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def _check_buffers(tree: dict[str, Any], path: Path, max_bytes: int | None) -> None:
-    total, folder = 0, path.parent.resolve()
+    total, folder = 0, path.parent
     for number, buffer in enumerate(tree.get("buffers", ())):
         uri = buffer.get("uri")
         if uri is None:
@@ -136,12 +160,7 @@ def _check_buffers(tree: dict[str, Any], path: Path, max_bytes: int | None) -> N
                 raise UnreadableError(f"buffer {number} must be in base64: got {kind[:80]!r}")
             there = len(base64.b64decode(text))
         else:
-            file = (folder / unquote(uri)).resolve()
-            if "://" in uri or not file.is_relative_to(folder):
-                raise UnreadableError(f"buffer {number} must lie beside it: got {uri[:80]!r}")
-            if not file.is_file():
-                raise UnreadableError(f"buffer {number} is missing: {uri[:80]!r}; put it beside it")
-            there = file.stat().st_size
+            there = file_of_uri(uri, folder, f"buffer {number}").stat().st_size
         if there < buffer["byteLength"]:
             raise UnreadableError(
                 f"buffer {number} announces {buffer['byteLength']:,} bytes and has {there:,}"

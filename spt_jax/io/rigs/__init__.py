@@ -1,0 +1,1 @@
+"""Rigged characters: glTF's skins, morph targets and animations, read and written."""
