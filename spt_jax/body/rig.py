@@ -33,8 +33,9 @@ class RigModel(AbstractBody):
         vertices = sum over bones k of weights_k G_joint(k) inverse_bind_k (template + targets b)
 
     A pose turns joints away from how they stood when the skin was bound:
-    R_j = Q_j^T exp(pose_j) Q_j R_bind_j, Q_j the rotation from the joint's space to the world, so
-    that the zero pose is the bind pose and axes are the world's, as in `BodyModel`.
+    R_j = Q_j^T exp(pose_j) Q_j R_bind_j, Q_j the turn from the joint's space to the world (it
+    mirrors where the character is mirrored), so that the zero pose is the bind pose and axes are
+    the world's, as in `BodyModel`.
 
     Get one from `load_rig`, or from `load_body` with a .glb, .gltf or .vrm file. It goes where
     bodies go: `untangle_pose`, `untangle_motion`, the penalty with its `rest_surface`.

@@ -20,6 +20,8 @@ from spt_jax.io.rigs.welding import Mesh, welded
 
 # Bones of one joint that were bound within this part of the character's size are one.
 _SAME = 1e-6
+# Files of float32 that were bound in one pose agree about it to this.
+_AGREED = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,8 @@ class Built:
         body: the rig.
         joints: how its joints stand in the file's nodes.
         targets: of each node with morph targets, the place of its first coefficient.
-        rows: of each vertex of the file's primitives, one after the other, that of the body.
+        rows: of each vertex of the file's primitives, one after the other, that of the body; -1
+            where no triangle has it.
         scale: what the file's lengths were multiplied by.
     """
 
@@ -58,8 +61,8 @@ def build(
         TooLargeError: its weights or morph targets take more than the limit.
     """
     joints = place_joints(nodes, skins, character, animations)
-    mesh, targets, names = _assemble(document, nodes, skins, character, joints, notes)
-    mesh = welded(mesh, notes)
+    raw, targets, names = _assemble(document, nodes, skins, character, joints, notes)
+    mesh = welded(raw, notes)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     factor = _unit(extent, scale, notes)
     before = joints.before.copy()
@@ -180,13 +183,24 @@ def _bones(nodes: Nodes, skins: list[Skin], joints: Joints, part: Part):
 
 
 def _bound_where(primitive, owners, matrices, joints: Joints) -> Float[np.ndarray, "4 4"]:
-    """What takes a part's vertices to where they are in the zero pose: by its heaviest bone."""
+    """What takes a part's vertices to where they are in the zero pose.
+
+    All bones agree about that where the skin was bound in it; otherwise those say so that agree
+    with each other and together weigh most.
+    """
     total = np.zeros(len(owners))
     np.add.at(total, primitive.joints, primitive.weights)
-    for bone in np.argsort(-total, kind="stable"):
-        matrix = joints.world[owners[bone]] @ matrices[bone]
-        if np.linalg.cond(matrix[:3, :3]) < 1e6:
-            return matrix
+    found = joints.world[np.array(owners)] @ matrices
+    size = np.linalg.norm(found[:, :3, :3], axis=(1, 2))
+    far = np.abs(primitive.vertices).max(initial=1e-12)
+    votes = np.zeros(len(owners))
+    for bone in np.flatnonzero(total > 0):
+        apart = np.abs(found - found[bone])
+        off = apart[:, :3, :3].max(axis=(1, 2)) + apart[:, :3, 3].max(axis=1) / far
+        votes[bone] = total[off < _AGREED * size[bone]].sum()
+    for bone in np.argsort(-votes, kind="stable"):
+        if np.linalg.cond(found[bone, :3, :3]) < 1e6:
+            return found[bone]
     return np.eye(4)
 
 

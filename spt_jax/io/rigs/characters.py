@@ -1,5 +1,6 @@
 """Which nodes of a glTF are one character: skins that share joints, and what hangs on them."""
 
+import heapq
 from typing import NamedTuple
 
 import numpy as np
@@ -117,7 +118,8 @@ def find_characters(
         hung = [p for p in parts if p.skin is None and own & set(nodes.up(p.node))]
         chosen = [p for p in parts if p.skin in group or p in hung]
         taken |= set(chosen)
-        joints = _joints(nodes, own, animated)
+        listed = list(dict.fromkeys(joint for k in group for joint in skins[k].joints))
+        joints = _joints(nodes, listed, animated)
         first = next(part for part in chosen if part.skin is not None)
         holder = nodes.parents[first.node]
         name = nodes.names[holder if holder >= 0 else first.node]
@@ -154,17 +156,26 @@ def _groups(nodes: Nodes, skins: list[Skin], used: list[int]) -> list[list[int]]
     return list(found.values())
 
 
-def _joints(nodes: Nodes, own: set[int], animated: set[int]) -> tuple[int, ...]:
-    """The joints that move a character, parents first.
+def _joints(nodes: Nodes, listed: list[int], animated: set[int]) -> tuple[int, ...]:
+    """The joints that move a character, parents first, otherwise in the order of the skins.
 
     They are those of its skins and all above them that an animation moves. Where several of these
     have none above, the lowest node above all comes in as the root.
     """
-    above = {node for joint in own for node in nodes.up(joint)}
-    chosen = own | (above & animated)
+    above = {node for joint in listed for node in nodes.up(joint)}
+    chosen = set(listed) | (above & animated)
     tops = [node for node in chosen if not chosen & set(nodes.up(node)[1:])]
     root = tops[0] if len(tops) == 1 else nodes.common(tops)
     chosen |= {root}
-    depth = {node: len(nodes.up(node)) for node in chosen}
-    ordered = sorted(chosen - {root}, key=lambda node: (depth[node], node))
-    return (root, *ordered)
+    place = {node: k for k, node in enumerate([*listed, *sorted(chosen - set(listed))])}
+    below: dict[int, list[int]] = {}
+    for node in chosen - {root}:
+        holder = next((up for up in nodes.up(node)[1:] if up in chosen), root)
+        below.setdefault(holder, []).append(node)
+    ordered, ready = [], [(place[root], root)]
+    while ready:
+        _, node = heapq.heappop(ready)
+        ordered.append(node)
+        for child in below.get(node, ()):
+            heapq.heappush(ready, (place[child], child))
+    return tuple(ordered)

@@ -127,7 +127,7 @@ class Document:
         return values
 
     def _rows(self, holder: dict[str, Any], count: int, width: int, dtype: np.dtype, where: str):
-        """Elements of a buffer view, which is held against its buffer and the elements against it."""
+        """Elements of a buffer view, once they lie within it, and it within its buffer."""
         view = self.item("bufferViews", holder["bufferView"], f"the bufferView of {where}")
         buffers = len(self.buffers)
         which = checked_index(view.get("buffer"), buffers, f"the buffer of {where} must exist")
@@ -140,8 +140,8 @@ class Document:
         there = min(length, len(self.buffers[which]) - start)
         if stride < element or needed > there:
             raise UnreadableError(
-                f"{where} announces {count:,} elements of {element} bytes, {needed:,} bytes in all, "
-                f"of a view that has {max(there, 0):,}; the file is cut or damaged, export it again"
+                f"{where} announces {count:,} elements of {element} bytes, {needed:,} bytes of a "
+                f"view that has {max(there, 0):,}; the file is cut or damaged, export it again"
             )
         return np.ndarray(
             (count, width),

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from spt_jax.io.rigs.animations import Animation
 from spt_jax.io.rigs.characters import Character, Skin
-from spt_jax.io.rigs.nodes import Local, Nodes, affine, nearest_rotation
+from spt_jax.io.rigs.nodes import Local, Nodes, affine, nearest_frame, nearest_rotation
 
 # What a joint shifts or scales less than, as a part of the whole, is rounding.
 _STILL = 1e-6
@@ -63,7 +63,7 @@ def place_joints(
         up = world[parents[joint]] if joint else np.eye(4)
         turn = _bind_rotation(joint, parents, before, own, turns, binds)
         stands = up @ before[joint]
-        frames.append(nearest_rotation(stands[:3, :3]))
+        frames.append(nearest_frame(stands[:3, :3]))
         turns.append(turn)
         world.append(stands @ affine(turn @ local.stretch, local.translation))
     shifting, scaling = _moving(place, own, animations, np.stack(world))

@@ -159,6 +159,11 @@ def nearest_rotation(linear: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
     return left @ right
 
 
+def nearest_frame(linear: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The same, mirrored where the map mirrors."""
+    return nearest_rotation(linear) if np.linalg.det(linear) > 0 else -nearest_rotation(-linear)
+
+
 def matrices_of_quaternions(turn: Float[np.ndarray, "*N 4"]) -> Float[np.ndarray, "*N 3 3"]:
     """Rotation matrices of quaternions (x, y, z, w), of any length but zero."""
     x, y, z, w = np.moveaxis(turn / np.linalg.norm(turn, axis=-1, keepdims=True), -1, 0)

@@ -35,7 +35,8 @@ class RigFile:
         animations: names of its animations, in the file's order.
         notes: what was done or left out to read it, one sentence each.
         rows: of each vertex of the character's primitives, one after the other in the order of
-            their nodes, that of `body`: vertices along seams are joined.
+            their nodes, that of `body`: vertices along seams are joined, and those that no triangle
+            has are left out, -1.
     """
 
     path: Path

@@ -136,9 +136,7 @@ class Written:
     def __init__(self, tree: dict[str, Any], document: Document):
         self.tree, self._source = tree, document
         self._data = bytearray()
-        starts = []
-        for buffer in document.buffers:
-            starts.append(self._append(buffer))
+        starts = [self._append(buffer) for buffer in document.buffers]
         if len(document.buffers) > 1:
             for view in tree.get("bufferViews", ()):
                 view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]

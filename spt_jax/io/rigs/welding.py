@@ -22,7 +22,7 @@ class Mesh(NamedTuple):
         weights: of each vertex to each bone.
         targets: what each morph target adds.
         bones, inverse_bind: of each bone its joint, and what takes vertices into its space.
-        rows: of each vertex of the file, that of this mesh.
+        rows: of each vertex of the file, that of this mesh; -1 where no triangle has it.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -70,12 +70,17 @@ def welded(mesh: Mesh, notes: list[str]) -> Mesh:
         weights /= count[:, None]
     if gone.any():
         notes.append(f"{int(gone.sum())} triangles without area left out")
+    faces = faces[~gone]
+    # Primitives that share an array of vertices use a part of it each.
+    used = np.zeros(len(kept), bool)
+    used[faces] = True
+    place = np.where(used, np.cumsum(used) - 1, -1)
     return mesh._replace(
-        vertices=mesh.vertices[kept],
-        faces=faces[~gone],
-        weights=weights,
-        targets=mesh.targets[kept],
-        rows=rows,
+        vertices=mesh.vertices[kept[used]],
+        faces=place[faces],
+        weights=weights[used],
+        targets=mesh.targets[kept[used]],
+        rows=place[rows],
     )
 
 
