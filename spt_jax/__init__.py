@@ -32,6 +32,7 @@ if typing.TYPE_CHECKING:
     from spt_jax._status import RESULTS as RESULTS
     from spt_jax.body import BodyModel as BodyModel
     from spt_jax.body import PosedBody as PosedBody
+    from spt_jax.body import RigModel as RigModel
     from spt_jax.body import load_body as load_body
     from spt_jax.body import load_mocap as load_mocap
     from spt_jax.fit.people import Penetration as Penetration
@@ -40,6 +41,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.fit.pose import fit_pose as fit_pose
     from spt_jax.fit.result import FitResult as FitResult
     from spt_jax.io.pose_files import load_poses as load_poses
+    from spt_jax.io.rigs.reading import load_rig as load_rig
     from spt_jax.keypoints import KeypointRegressor as KeypointRegressor
     from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
     from spt_jax.keypoints import read_keypoints as read_keypoints
@@ -73,6 +75,7 @@ __all__ = [
     "PinholeCamera",
     "PosedBody",
     "RestSurface",
+    "RigModel",
     "Scene",
     "Step",
     "UntangleMeshResult",
@@ -93,6 +96,7 @@ __all__ = [
     "load_body",
     "load_mocap",
     "load_poses",
+    "load_rig",
     "paper_penalty",
     "read_keypoints",
     "self_intersection_penalty",
@@ -109,6 +113,7 @@ __getattr__, __dir__ = _lazy_names(
     {
         "BodyModel": "spt_jax.body",
         "PosedBody": "spt_jax.body",
+        "RigModel": "spt_jax.body",
         "load_body": "spt_jax.body",
         "load_mocap": "spt_jax.body",
         "clear_caches": "spt_jax._caches",
@@ -141,6 +146,7 @@ __getattr__, __dir__ = _lazy_names(
         "fit_pose": "spt_jax.fit.pose",
         "keypoint_regressor": "spt_jax.keypoints",
         "load_poses": "spt_jax.io.pose_files",
+        "load_rig": "spt_jax.io.rigs.reading",
         "read_keypoints": "spt_jax.keypoints",
         "untangle_mesh": "spt_jax.untangle.mesh",
         "MotionResult": "spt_jax.untangle.motion",

@@ -318,6 +318,8 @@ def hard_rig(*, mirrored=False):
     ]
     more, corners = _tube(5, 5, radius=6.0, seam=False)
     more = (straight[1] @ np.c_[more * 0.7 + [20, 0, 0], np.ones(len(more))].T).T[:, :3]
+    if mirrored:
+        corners = corners[:, [0, 2, 1]]
     second = {
         "attributes": {
             "POSITION": w.accessor(more, "VEC3"),

