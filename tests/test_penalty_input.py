@@ -9,7 +9,7 @@ from helpers import box, embedded_body
 from helpers_penalty import FACES, PAIR, as_jax, loss
 
 from spt_jax import RestSurface, classify_vertices, intersection_report, self_intersection_penalty
-from spt_jax.overlap.triangles import pairs
+from spt_jax.overlap.triangles import near_triangles
 from spt_jax.xla.settings import Xla
 
 OPTIONS = {
@@ -191,8 +191,8 @@ def test_a_mesh_that_rounding_has_eaten_is_nan_and_a_point_is_free(dtype, rays):
 
 
 def test_a_crumpled_mesh_is_nan_and_the_report_says_why(monkeypatch, rng):
-    monkeypatch.setattr(pairs, "_MOST_PAIRS", 1000)
-    monkeypatch.setattr(pairs, "_MOST_PAIRS_EACH", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS", 1000)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS_EACH", 0)
     faces = trimesh.creation.icosphere(3).faces
     vertices = rng.normal(size=(faces.max() + 1, 3))
     crumpled = jnp.asarray(vertices, jnp.float32)

@@ -15,7 +15,7 @@ from spt_jax import (
 )
 from spt_jax.cli.main import main
 from spt_jax.overlap.measure import Unmeasurable, measure
-from spt_jax.overlap.triangles import pairs
+from spt_jax.overlap.triangles import near_triangles
 from spt_jax.view.scene import Scene
 
 VERTICES, FACES = join(box(), box(center=(0.5, 0.1, 0.2)))
@@ -95,8 +95,8 @@ def test_the_others_of_a_batch_are_measured(dtype):
 @pytest.fixture
 def crumpled(monkeypatch):
     """As if two boxes in each other were too many pairs to be listed."""
-    monkeypatch.setattr(pairs, "_MOST_PAIRS", 0)
-    monkeypatch.setattr(pairs, "_MOST_PAIRS_EACH", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS_EACH", 0)
     return sphere(subdivisions=2), sphere(center=(1.2, 0.0, 0.0), subdivisions=2)
 
 
@@ -147,8 +147,8 @@ def test_many_spheres_in_one_place_end_with_a_result(suffix, tmp_path, capsys):
 @pytest.mark.parametrize("options", [{}, {"value": "ratio"}, {"gradient": "vertex"}])
 def test_rays_list_no_pairs_where_none_are_asked_for(options, monkeypatch):
     """What is too crumpled to be listed has a volume by rays, and NaN where labels need a list."""
-    monkeypatch.setattr(pairs, "_MOST_PAIRS", 0)
-    monkeypatch.setattr(pairs, "_MOST_PAIRS_EACH", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS_EACH", 0)
     vertices, faces = join(box(), box(center=(0.5, 0.2, 0.3)))
     step = jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, rays=32, **options))
     value, gradient = step(jnp.asarray(vertices, "float32"))

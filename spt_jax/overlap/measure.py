@@ -15,7 +15,7 @@ from spt_jax.overlap.rays.beam import Beam, Rays, aim
 from spt_jax.overlap.rays.crossings import cast
 from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
 from spt_jax.overlap.surface import ExactSurface, regions_of
-from spt_jax.overlap.triangles.pairs import Entangled
+from spt_jax.overlap.triangles.near_triangles import Entangled
 
 Directions = tuple[tuple[float, float, float], ...]
 Value = Literal["volume", "ratio"]

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from spt_jax.overlap.exclusions import Exclusions, part_rules
+from spt_jax.overlap.ranges import unique
 from spt_jax.overlap.triangles.closed_form import Shares, of_copies, shares_of, volumes_of
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours, find_contours
@@ -290,7 +291,7 @@ def parts_in_each_other(
         Numbers of parts, the lower first.
     """
     manifold = manifold_of(faces, len(vertices))
-    named = np.unique(manifold.part[manifold.faces])
+    named = unique(manifold.part[manifold.faces].ravel())
     if len(named) < 2:
         return np.zeros((0, 2), np.int64)
     surface = ExactSurface(vertices, faces, float(np.finfo(np.float64).eps))

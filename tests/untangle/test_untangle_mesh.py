@@ -25,7 +25,7 @@ from spt_jax import RESULTS
 from spt_jax.cli.main import main
 from spt_jax.io.mesh_files import read_mesh, write_mesh
 from spt_jax.overlap.measure import Unmeasurable, measure
-from spt_jax.overlap.triangles import pairs as pairs_module
+from spt_jax.overlap.triangles import near_triangles
 from spt_jax.overlap.triangles.pairs import edge_crossings
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.freeing import _Search
@@ -305,8 +305,8 @@ def test_what_cannot_be_measured_is_refused(dtype, monkeypatch):
     ):
         with pytest.raises(ValueError, match="NaN or infinity"):
             untangle_mesh(wrong.astype(dtype), faces)
-    monkeypatch.setattr(pairs_module, "_MOST_PAIRS", 0)
-    monkeypatch.setattr(pairs_module, "_MOST_PAIRS_EACH", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS", 0)
+    monkeypatch.setattr(near_triangles, "_MOST_PAIRS_EACH", 0)
     with pytest.raises(Unmeasurable, match="coordinates that exploded or collapsed"):
         untangle_mesh(vertices.astype(dtype), faces)
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Int
 
-from spt_jax.overlap.ranges import spread
+from spt_jax.overlap.ranges import spread, unique
 
 # Vertices to a block: of a posed body 20 to 60 blocks are cut.
 _SIZE = 32
@@ -94,7 +94,7 @@ def blocks_of(ends: Int[np.ndarray, "R 2"], count: int) -> Blocks:
     owner = np.concatenate([of_ends[:, 0], of_ends[across, 1]])
     order = np.argsort(owner, kind="stable")
     size = len(seeds)
-    links = np.unique(np.sort(of_ends[across], axis=1) @ [size, 1])
+    links = unique(np.sort(of_ends[across], axis=1) @ [size, 1])
     return Blocks(
         ends=ends,
         block=block,

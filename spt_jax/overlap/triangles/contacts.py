@@ -1,10 +1,12 @@
 """Vertices that lie on triangles which are not theirs."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.ranges import unique
 from spt_jax.overlap.triangles.pair_boxes import Shape, cross
 from spt_jax.overlap.triangles.pair_layout import Layout
 from spt_jax.overlap.triangles.pair_planes import dot, heights
@@ -27,16 +29,24 @@ class Contacts:
 
 
 def contacts_of(
-    layout: Layout, shape: Shape, near: Int[np.ndarray, "2 N"], reach: float
+    layout: Layout, shape: Shape, near: Iterable[Int[np.ndarray, "2 _"]], reach: float
 ) -> Contacts:
     """The corners of triangles that lie on others.
 
     Args:
         layout, shape: the triangles.
-        near: slots, of triangles with a corner in the plane of another, and of these others.
+        near: slots, of triangles with a corner in the plane of another, and of these others; in
+            parts, each of which is looked at before the next is asked for.
         reach: how near to a triangle a vertex lies on it.
     """
-    x, y = near
+    # As single numbers they sort ten times as fast as by rows.
+    count = max(len(layout.slot), 1)
+    found = [np.zeros(0, np.int64), *(_on(layout, shape, x, y, reach) for x, y in near)]
+    return Contacts(*np.divmod(unique(np.concatenate(found)), count))
+
+
+def _on(layout: Layout, shape: Shape, x, y, reach: float):
+    """Corners of the triangles x that lie on the triangles y: vertex times face count plus face."""
     points, normal = shape.corner.take(x, axis=2), shape.normal.take(y, axis=1)
     length, sense = shape.length.take(y), layout.sense.take(y)
     on = np.abs(heights(shape, points, shape.extent.take(x), y)[0]) <= reach * length
@@ -47,7 +57,4 @@ def contacts_of(
         inward = dot(cross(normal, side)[:, None] * sense, points - start[:, None])
         on &= inward >= -reach * length * np.sqrt(dot(side, side))
     corner, pair = np.nonzero(on)
-    vertex, face = layout.corners[corner, x[pair]], layout.face[y[pair]]
-    # As single numbers they sort ten times as fast as by rows.
-    count = max(len(layout.slot), 1)
-    return Contacts(*np.divmod(np.unique(vertex * count + face), count))
+    return layout.corners[corner, x[pair]] * len(layout.slot) + layout.face[y[pair]]

@@ -5,7 +5,7 @@ triangles make a cluster is kept in `pair_layout.py`.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
@@ -35,6 +35,8 @@ _SHORT_GUARDS = np.uint32(sum(1 << (_SHORT_FIELD * k + _SHORT_FIELD - 1) for k i
 _SHORT_SIGNS = np.uint32(sum(1 << (_SHORT_FIELD * k + _SHORT_FIELD - 2) for k in range(3)))
 # Clusters so many times as large as the usual one are compared in long words.
 _LARGE = 5
+# So many pairs of boxes tell whether most only touch.
+_SAMPLE = 256
 Pairs = list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -123,6 +125,33 @@ def near_groups(mesh: Prepared, points):
                 mesh.usual_pairs = count
             return layout, shape, clusters, pairs
         layout, fresh = None, True
+
+
+def ranked(shape: Shape, layout: Layout, ranks: Int[np.ndarray, "3 V"]):
+    """The same triangles with boxes of ranks, the clusters, and the pairs of groups that meet.
+
+    Args:
+        ranks: each vertex's place in the order along each axis, below `STEPS`.
+    """
+    corner = ranks.take(layout.corners, axis=1)
+    low, high = corner.min(axis=1), corner.max(axis=1)
+    low[:, layout.empty], high[:, layout.empty] = STEPS + 2, 0
+    groups = joined(*around(*around(low, high)))
+    clusters = joined(*around(low, high), groups)
+    words = {"low_word": word(low), "high_word": word(high) | GUARDS}
+    return replace(shape, low=low, high=high, **words), clusters, list(meeting_boxes(groups))
+
+
+def touching_share(shape: Shape, t, u) -> float:
+    """What part of some pairs of triangles have boxes that share no more than a side.
+
+    Args:
+        t, u: their slots; some are looked at.
+    """
+    step = max(len(t) // _SAMPLE, 1)
+    boxes = [shape.corner.take(x[::step], axis=2) for x in (t, u)]
+    (low, high), (other_low, other_high) = ((x.min(axis=1), x.max(axis=1)) for x in boxes)
+    return float(((high == other_low) | (other_high == low)).any(axis=0).mean())
 
 
 def near_pairs(layout: Layout, shape: Shape, clusters: Boxes, groups: Pairs, touching):

@@ -19,6 +19,7 @@ def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
         The slots t and u of the pairs; and (2, N), slots with such a corner, and of such a plane.
     """
     near_corners = []
+    together = np.zeros(len(t), bool)  # in one plane, and not apart in it
     for turn in (0, 1):
         x, y = (t, u) if turn else (u, t)
         height, margin = heights(shape, shape.corner.take(x, axis=2), shape.extent.take(x), y)
@@ -26,11 +27,15 @@ def not_apart(layout: Layout, shape: Shape, t, u, reach: float):
         np.maximum(margin, near, out=margin)
         kept = np.flatnonzero((height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin))
         height, margin, near = height.take(kept, axis=1), margin.take(kept), near.take(kept)
-        flat = np.flatnonzero(np.abs(height).max(axis=0) <= margin)
+        together = together.take(kept)
+        flat = np.flatnonzero((np.abs(height).max(axis=0) <= margin) & ~together)
         if len(flat):
-            # In one plane; nearly all of a flat side's are apart in it.
-            apart = flat[_apart_in_plane(layout, shape, x[kept[flat]], y[kept[flat]], reach)]
-            kept, height, near = (np.delete(of, apart, axis=-1) for of in (kept, height, near))
+            # Nearly all of a flat side's are apart in its plane.
+            apart = _apart_in_plane(layout, shape, x[kept[flat]], y[kept[flat]], reach)
+            together[flat] = True
+            gone = flat[apart]
+            kept, height, near = (np.delete(of, gone, axis=-1) for of in (kept, height, near))
+            together = np.delete(together, gone)
         on = np.flatnonzero(np.abs(height).min(axis=0) <= near)
         near_corners.append(np.stack([x[kept[on]], y[kept[on]]]))
         t, u = t[kept], u[kept]

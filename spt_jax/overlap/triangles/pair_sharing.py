@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.ranges import unique
+
 # A vertex of more clusters than this, the center of a large fan, is left to the comparison of
 # vertices: its pairs of clusters would grow with the square of its triangles.
 _MOST_CLUSTERS = 16
@@ -59,7 +61,7 @@ def sharing(corners: Int[np.ndarray, "3 S"], filled: Bool[np.ndarray, "S"], size
     clusters, groups = corners.shape[1] // size, corners.shape[1] // size**2
     slot = np.flatnonzero(filled)
     vertex, cluster = np.divmod(
-        np.unique((corners[:, slot] * clusters + slot // size).ravel()), max(clusters, 1)
+        unique((corners[:, slot] * clusters + slot // size).ravel()), max(clusters, 1)
     )
     # Each cluster at a vertex with those that come after it there.
     new = np.flatnonzero(np.concatenate([[True], np.diff(vertex) != 0])[: len(vertex)])
@@ -72,7 +74,7 @@ def sharing(corners: Int[np.ndarray, "3 S"], filled: Bool[np.ndarray, "S"], size
         for step in range(1, min(int(count.max(initial=0)), _MOST_CLUSTERS))
         for kept in [np.flatnonzero(few & (here + step < stop))]
     ]
-    found = np.unique(np.concatenate([np.zeros(0, np.int64), *pairs]))
+    found = unique(np.concatenate([np.zeros(0, np.int64), *pairs]))
     first, second = np.divmod(found, max(clusters, 1))
     apart = np.ones((len(found) + 1, size, size), bool)
     by_cluster = corners.reshape(3, -1, size)

@@ -13,29 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from spt_jax.overlap.ranges import spread
-from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
-from spt_jax.overlap.triangles.pair_boxes import (
-    Shape,
-    concatenate,
-    near_groups,
-    near_pairs,
-    parts,
-)
+from spt_jax.overlap.ranges import spread, unique
+from spt_jax.overlap.triangles.contacts import Contacts
+from spt_jax.overlap.triangles.near_triangles import NearTriangles
+from spt_jax.overlap.triangles.pair_boxes import Shape, concatenate, parts
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
-from spt_jax.overlap.triangles.pair_planes import ROUNDING, not_apart, straddles
+from spt_jax.overlap.triangles.pair_planes import ROUNDING, straddles
 from spt_jax.overlap.triangles.predicates import Predicates
-from spt_jax.overlap.triangles.warm_pairs import warm_pairs
-
-# Upper bound on face pairs that the plane of neither face separates. A mesh with more is noise, and
-# the list would exhaust memory: a body of 24,540 triangles has 1,800, with joints turned by 2 rad
-# at random 16,000, with every vertex moved by 5 mm at random 200,000, by 20 mm, a triangle's size,
-# 2,300,000.
-_MOST_PAIRS, _MOST_PAIRS_EACH = 2_000_000, 20
-
-
-class Entangled(ValueError):
-    """A mesh is so crumpled that its triangles' pairs cannot be listed."""
 
 
 @dataclass(frozen=True)
@@ -143,26 +127,10 @@ def find_intersections(
     mesh = prepared(faces, len(vertices))
     topology = mesh.topology
     touching = None if among is None else _touching(topology, among)
-    layout, shape, clusters, groups = near_groups(mesh, points)
-    found = list(_around_vertices(points, topology, layout, shape))
-    seen, most = 0, _MOST_PAIRS + _MOST_PAIRS_EACH * len(faces)
-    near = [np.zeros((2, 0), np.int64)]
-    if touching is None:
-        scale = predicates.scale
-        pairs = warm_pairs(mesh, points, scale, layout, shape, clusters, groups)
-    else:
-        pairs = near_pairs(layout, shape, clusters, groups, touching)
-    for t, u in pairs:
-        t, u, in_plane = not_apart(layout, shape, t, u, reach)
-        near.append(in_plane)
-        seen += len(t)
-        if seen > most:
-            raise Entangled(
-                "vertices must be a surface whose triangles mostly lie apart: got more than "
-                f"{most:,} pairs of {len(faces):,} triangles that are near each other; look for "
-                "coordinates that exploded or collapsed."
-            )
-        found.append(_edges_of_pairs(topology, layout, *_straddling(predicates, layout, t, u)))
+    near = NearTriangles(mesh, predicates, reach, touching)
+    layout = near.layout
+    found = list(_around_vertices(points, topology, layout, near.shape))
+    found += [_edges_of_pairs(topology, layout, t, u) for t, u in near.straddling()]
     row, slot = concatenate(found) if found else (nothing, nothing)
     if among is not None:
         kept = _edges_of(topology, among)[topology.edge_id[row]] | among[layout.face[slot]]
@@ -175,7 +143,7 @@ def find_intersections(
     p, q = np.float64(vertices[ends[:, 0]]), np.float64(vertices[ends[:, 1]])
     point = p + part[:, None] * (q - p)
     found = EdgeCrossings(ends, topology.edge_faces[row], row, face, part, point, jump)
-    return found, lambda: contacts_of(layout, shape, np.concatenate(near, axis=1), reach)
+    return found, lambda: near.contacts
 
 
 def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
@@ -203,7 +171,7 @@ def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
     low, high = np.minimum(of_edge, through), np.maximum(of_edge, through)
     # As single numbers they sort ten times as fast as by rows.
     count = int(high.max(initial=-1)) + 1
-    return np.stack(np.divmod(np.unique(low * count + high), max(count, 1)), axis=1)
+    return np.stack(np.divmod(unique(low * count + high), max(count, 1)), axis=1)
 
 
 def _edges_of(topology: Topology, among):
@@ -289,17 +257,6 @@ def _medians(shape: Shape, layout: Layout, axis: UInt8[np.ndarray, "V"]) -> Int[
     found = corner == np.arange(3, dtype=np.uint8)[:, None]
     found[:, layout.empty] = False
     return np.bincount(layout.corners.ravel().take(np.flatnonzero(found)), minlength=len(axis))
-
-
-def _straddling(predicates: Predicates, layout: Layout, t, u):
-    """The pairs of triangles each of which has corners on both sides of the other's plane."""
-    for turn in (0, 1):
-        x, y = (t, u) if turn else (u, t)
-        plane, corner = layout.corners.take(y, axis=1), layout.corners.take(x, axis=1)
-        side, _ = predicates.volume(plane, corner, y * predicates.points.shape[1] + corner)
-        kept = np.flatnonzero(np.abs(side.sum(axis=0)) < 3)
-        t, u = t[kept], u[kept]
-    return t, u
 
 
 def _edges_of_pairs(topology: Topology, layout: Layout, t, u):

@@ -18,18 +18,23 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.triangles.determinants import (
+    BOUND,
+    LEAST,
+    derivative,
+    determinant,
+    doubled_determinants,
+    largest_of,
+    permanent,
+    units,
+    vanishes,
+    whole_coefficient,
+    whole_determinants,
+)
 from spt_jax.overlap.vectors import area_normals, summed
 
-# Rounding of a determinant of three differences, against the product of their largest entries: six
-# products of three factors, each factor rounded once, with two roundings a product and at most five
-# in the sums. Twice that, so that nobody has to count again.
-_BOUND = 128 * 2.0**-53
 # The same against the sum of the products' sizes.
 _RELATIVE = 16 * 2.0**-53
-# The same with twice the digits: each operation loses a few units of 2^-106.
-_DOUBLED = 2.0**-97
-# Products below this may have lost bits to underflow.
-_LEAST = 2.0**-900
 
 # Heights of both ends below this many times what rounding may add are worked out exactly.
 _POOR = 2.0**16
@@ -83,8 +88,25 @@ class Predicates:
             depth += self._part / (1.0 + self._part.max(initial=0))
         return np.rint(-_STEP * (depth[:, None] * normal).T) + np.rint(_NOISE * _noise(count))
 
+    @cached_property
+    def _units(self) -> Int[np.ndarray, "V"]:
+        return units(self.points)
+
+    @cached_property
+    def ranks(self) -> Int[np.ndarray, "3 V"]:
+        """The vertices' order along each axis, in which those in one place follow their pushes.
+
+        Vertices of the same push have the same number.
+        """
+        found = np.empty(self.points.shape, np.int64)
+        for place, push, rank in zip(self.points, self.push, found, strict=True):
+            order = np.lexsort((push, place))
+            new = (np.diff(place[order]) != 0) | (np.diff(push[order]) != 0)
+            rank[order] = np.append(0, np.cumsum(new))[: len(order)]
+        return found
+
     def volume(
-        self, base, apex, key=None
+        self, base, apex, key=None, if_alike: bool = False
     ) -> tuple[Int[np.ndarray, "*M N"], Float[np.ndarray, "*M N"]]:
         """Signs of tetrahedra's volumes, positive where the apex is on the base's normal's side.
 
@@ -92,6 +114,8 @@ class Predicates:
             base: (3, N), the vertices of each tetrahedron's base.
             apex: (N), its fourth vertex, different from those; or (M, N), several for each base.
             key: numbers that are the same for the same tetrahedra, where many are asked for again.
+            if_alike: whether only those bases are of interest whose signs are all the same; for
+                others some sign is +1 and some is -1, and which is which is not told.
 
         Returns:
             The signs, +1 or -1, and six times the volumes: to rounding, and 0.0 where they vanish.
@@ -100,12 +124,14 @@ class Predicates:
         u, v = (self.points.take(x, axis=1) - origin for x in base[1:])
         w = self.points.take(apex, axis=1)
         w -= origin if apex.ndim == 1 else origin[:, None]
-        value = _determinant(u, v, w)
-        bound = _BOUND * (_largest(u) * _largest(v) * _largest(w)) + _LEAST
-        return self._decided(value, bound, (*base, apex), (0, 1, 2), key)
+        value = determinant(u, v, w)
+        bound = BOUND * (largest_of(u) * largest_of(v) * largest_of(w)) + LEAST
+        return self._decided(value, bound, (*base, apex), (0, 1, 2), key, if_alike)
 
     def turns(self, edge, triangle) -> Int[np.ndarray, "3 N"]:
         """On which side of an edge a triangle's sides pass: signs of the volumes pqab, pqbc, pqca.
+
+        Where they are not all the same, which is which is not told.
 
         Args:
             edge: (2, N), the vertices p and q.
@@ -115,11 +141,11 @@ class Predicates:
         along = self.points.take(edge[1], axis=1) - origin
         arms = self.points.take(triangle, axis=1) - origin[:, None]
         ends = arms[:, [1, 2, 0]]
-        size = _largest(arms)
-        value = _determinant(along[:, None], arms, ends)
-        bound = _BOUND * (_largest(along) * size * size[[1, 2, 0]]) + _LEAST
+        size = largest_of(arms)
+        value = determinant(along[:, None], arms, ends)
+        bound = BOUND * (largest_of(along) * size * size[[1, 2, 0]]) + LEAST
         corners = (*edge, triangle, triangle[[1, 2, 0]])
-        return self._decided(value, bound, corners, (0, 1, 2))[0]
+        return self._decided(value, bound, corners, (0, 1, 2), if_alike=True)[0]
 
     def area(self, a, b, c, axes: tuple[int, int]) -> Int[np.ndarray, "N"]:
         """Signs of the areas of triangles seen along an axis: +1 counter-clockwise, -1 clockwise.
@@ -131,8 +157,8 @@ class Predicates:
         points = self.points[list(axes)]
         origin = points.take(a, axis=1)
         u, v = (points.take(x, axis=1) - origin for x in (b, c))
-        value = _determinant(u, v)
-        bound = _BOUND * (_largest(u) * _largest(v)) + _LEAST
+        value = determinant(u, v)
+        bound = BOUND * (largest_of(u) * largest_of(v)) + LEAST
         return self._decided(value, bound, (a, b, c), axes)[0]
 
     def part_before(self, triangle, edge, height) -> Float[np.ndarray, "N"]:
@@ -145,8 +171,8 @@ class Predicates:
         """
         (a, b, c), (p, q) = triangle, edge
         origin = self.points.take(a, axis=1)
-        largest = [_largest(self.points.take(x, axis=1) - origin) for x in (b, c, p, q)]
-        bound = _BOUND * largest[0] * largest[1] * np.maximum(largest[2], largest[3]) + _LEAST
+        largest = [largest_of(self.points.take(x, axis=1) - origin) for x in (b, c, p, q)]
+        bound = BOUND * largest[0] * largest[1] * np.maximum(largest[2], largest[3]) + LEAST
         # Both ends almost in the plane: rounding would put the crossing anywhere on the edge.
         poor = np.flatnonzero(height.sum(axis=0) <= _POOR * bound)
         if len(poor):
@@ -154,7 +180,7 @@ class Predicates:
             height = height.copy()
             for k, end in enumerate((p, q)):
                 rows = [self.points.take(x, axis=1) for x in (*corners, end[poor])]
-                height[k, poor] = np.abs(_whole_determinants(rows)[0])
+                height[k, poor] = np.abs(whole_determinants(rows))
         total = height.sum(axis=0)
         part = height[0] / np.where(total > 0, total, 1.0)
         flat = np.flatnonzero(total == 0)
@@ -163,9 +189,12 @@ class Predicates:
             part[flat] = _middle_within(*corners)
         return np.clip(part, 0.0, 1.0)
 
-    def _decided(self, value, bound, corners, axes, key=None):
+    def _decided(self, value, bound, corners, axes, key=None, if_alike=False):
         sign = np.where(value < 0, -1, 1)
-        open_ = np.nonzero(np.abs(value) <= bound)
+        undecided = np.abs(value) <= bound
+        if if_alike and undecided.any():
+            undecided &= ~((value > bound).any(axis=0) & (value < -bound).any(axis=0))
+        open_ = np.nonzero(undecided)
         if not len(open_[0]):
             return sign, value
         corners = [np.broadcast_to(x, value.shape)[open_] for x in corners]
@@ -182,11 +211,11 @@ class Predicates:
         points = self.points[list(axes)]
         rows = [points.take(x, axis=1) for x in corners]
         edges = [x - rows[0] for x in rows[1:]]
-        value, size = _determinant(*edges), _permanent(*edges)
-        known = np.abs(value) > _RELATIVE * size + _LEAST
+        value, size = determinant(*edges), permanent(*edges)
+        known = np.abs(value) > _RELATIVE * size + LEAST
         # Products that are all zero sum to zero exactly, and so they do where two corners coincide.
-        small = np.flatnonzero(~known & (size <= _LEAST))
-        zero = small[_vanishes(*(x[:, small] for x in edges))]
+        small = np.flatnonzero(~known & (size <= LEAST))
+        zero = small[vanishes(*(x[:, small] for x in edges))]
         value[zero], known[zero] = 0.0, True
         if not known.all():
             alike = np.zeros(len(value), bool)
@@ -195,53 +224,57 @@ class Predicates:
                     alike |= (rows[i] == rows[j]).all(axis=0)
             value[alike] = 0.0
             known |= alike
-        for better in (_doubled_determinants, _whole_determinants):
-            left = np.flatnonzero(~known)
-            if len(left):
-                value[left], known[left] = better([x[:, left] for x in rows])
+        left = np.flatnonzero(~known)
+        if len(left):
+            unit = np.minimum.reduce([self._units.take(x[left]) for x in corners])
+            value[left], known[left] = doubled_determinants([x[:, left] for x in rows], unit)
+            left = left[~known[left]]
+        if len(left):
+            value[left] = whole_determinants([x[:, left] for x in rows])
         sign = np.sign(value).astype(np.int64)
         tied = np.flatnonzero(sign == 0)
         if len(tied):
-            sign[tied] = self._perturbed([x[tied] for x in corners], axes)
+            rows, corners = ([x[..., tied] for x in of] for of in (rows, corners))
+            sign[tied] = self._perturbed(rows, corners, axes)
         return sign, value
 
-    def _perturbed(self, corners, axes):
+    def _perturbed(self, rows, corners, axes):
         """Signs of vanishing determinants once every vertex is moved along its push."""
-        points, push = self.points[list(axes)], self.push[list(axes)]
-        rows = [points.take(x, axis=1) for x in corners]
+        push = self.push[list(axes)]
         moves = [push.take(x, axis=1) for x in corners]
         edges, turns = ([x - of[0] for x in of[1:]] for of in (rows, moves))
-        terms = [
-            [turns[k] if moved >> k & 1 else edges[k] for k in range(len(edges))]
-            for moved in range(1, 1 << len(edges))
-        ]
-        sign = np.zeros(rows[0].shape[1], np.int64)
+        value, bound = derivative(edges, turns)
+        sign = np.where(np.abs(value) > bound, np.sign(value), 0.0).astype(np.int64)
         for order in range(1, len(edges) + 1):
-            among = [t for m, t in enumerate(terms, 1) if m.bit_count() == order]
             open_ = np.flatnonzero(sign == 0)
             if not len(open_):
                 break
-            everything = len(open_) == len(sign)
-            # All terms of one order together, (3, terms, N).
-            factors = [
-                np.stack([x if everything else x[:, open_] for x in column], axis=1)
-                for column in zip(*among, strict=True)
-            ]
-            value = _determinant(*factors).sum(axis=0)
-            size = _permanent(*factors).sum(axis=0)
-            left = np.flatnonzero(np.abs(value) <= 2 * _RELATIVE * size + _LEAST)
-            if len(left):
-                zero = _vanishes(*(x[:, :, left] for x in factors)).all(axis=0)
-                value[left[zero]] = 0.0
-                left = left[~zero]
-            if len(left):
-                at = open_[left]
-                value[left] = _whole_coefficient(
-                    [x[:, at] for x in rows], [x[:, at] for x in moves], order
-                )
-            sign[open_] = np.sign(value)
+            at, by = ([x[:, open_] for x in of] for of in (rows, moves))
+            sign[open_] = self._coefficient(at, by, order)
         # Pushes that lie in one plane, all of them: one in 1e20.
         return np.where(sign == 0, 1, sign)
+
+    def _coefficient(self, rows, moves, order: int):
+        """Signs of the determinants' coefficients of eps^order."""
+        edges, turns = ([x - of[0] for x in of[1:]] for of in (rows, moves))
+        among = [
+            [turns[k] if moved >> k & 1 else edges[k] for k in range(len(edges))]
+            for moved in range(1, 1 << len(edges))
+            if moved.bit_count() == order
+        ]
+        # All terms together, (3, terms, N).
+        factors = [np.stack(column, axis=1) for column in zip(*among, strict=True)]
+        value = determinant(*factors).sum(axis=0)
+        size = permanent(*factors).sum(axis=0)
+        left = np.flatnonzero(np.abs(value) <= 2 * _RELATIVE * size + LEAST)
+        if len(left):
+            zero = vanishes(*(x[:, :, left] for x in factors)).all(axis=0)
+            value[left[zero]] = 0.0
+            left = left[~zero]
+        if len(left):
+            at, by = ([x[:, left] for x in of] for of in (rows, moves))
+            value[left] = whole_coefficient(at, by, order)
+        return np.sign(value).astype(np.int64)
 
 
 def _noise(count: int) -> Float[np.ndarray, "3 V"]:
@@ -269,19 +302,19 @@ def _middle_within(a, b, c, p, q):
     drop = normal.argmax(axis=0)
     seen = np.stack([(drop + 1) % 3, (drop + 2) % 3])
     a, b, c, p, q = (np.take_along_axis(x, seen, 0) for x in (a, b, c, p, q))
-    turn = np.sign(_determinant(b - a, c - a))
+    turn = np.sign(determinant(b - a, c - a))
     low, high = np.zeros(p.shape[1]), np.ones(p.shape[1])
     with np.errstate(all="ignore"):
         for start, end in ((a, b), (b, c), (c, a)):
-            at_p = turn * _determinant(end - start, p - start)
-            at_q = turn * _determinant(end - start, q - start)
+            at_p = turn * determinant(end - start, p - start)
+            at_q = turn * determinant(end - start, q - start)
             crossing = np.clip(at_p / (at_p - at_q), 0.0, 1.0)
             low = np.where((at_p < 0) & (at_q > 0), np.maximum(low, crossing), low)
             high = np.where((at_p > 0) & (at_q < 0), np.minimum(high, crossing), high)
         # A line instead of a triangle: where the edge meets it, or what they share of one line.
         along = q - p
         square = (along * along).sum(axis=0)
-        across = [_determinant(along, x - p) for x in (a, b, c)]
+        across = [determinant(along, x - p) for x in (a, b, c)]
         at = [((x - p) * along).sum(axis=0) / square for x in (a, b, c)]
         least, most = np.argmin(across, axis=0)[None], np.argmax(across, axis=0)[None]
         span = np.ptp(across, axis=0)
@@ -292,146 +325,3 @@ def _middle_within(a, b, c, p, q):
         line = np.where(span > 0, np.clip(meeting, 0.0, 1.0), shared)
     middle = np.where(turn != 0, (low + high) / 2, line)
     return np.where(np.isfinite(middle), middle, 0.5)
-
-
-def _largest(x):
-    size = np.abs(x)
-    return np.maximum.reduce(size, axis=0)
-
-
-def _determinant(u, v, w=None):
-    if w is None:
-        return u[0] * v[1] - u[1] * v[0]
-    return (
-        (u[1] * v[2] - u[2] * v[1]) * w[0]
-        + (u[2] * v[0] - u[0] * v[2]) * w[1]
-        + (u[0] * v[1] - u[1] * v[0]) * w[2]
-    )
-
-
-def _permanent(u, v, w=None):
-    u, v = np.abs(u), np.abs(v)
-    if w is None:
-        return u[0] * v[1] + u[1] * v[0]
-    w = np.abs(w)
-    return (
-        (u[1] * v[2] + u[2] * v[1]) * w[0]
-        + (u[2] * v[0] + u[0] * v[2]) * w[1]
-        + (u[0] * v[1] + u[1] * v[0]) * w[2]
-    )
-
-
-def _vanishes(*factors):
-    """Whether each product in the determinants has a factor of zero."""
-    return _permanent(*((x != 0).astype(np.float64) for x in factors)) == 0
-
-
-def _doubled_determinants(rows):
-    """Determinants of the differences to the first row, with twice the digits; where they tell."""
-    edges = [_difference(x, rows[0]) for x in rows[1:]]
-    terms = []
-    if len(edges) == 2:
-        (u, v) = edges
-        terms = [_times(_at(u, 0), _at(v, 1)), _times(_at(u, 1), _minus(_at(v, 0)))]
-    else:
-        u, v, w = edges
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            minor = _plus(_times(_at(u, i), _at(v, j)), _times(_at(u, j), _minus(_at(v, i))))
-            terms.append(_times(minor, _at(w, k)))
-    total = terms[0]
-    for term in terms[1:]:
-        total = _plus(total, term)
-    value = total[0] + total[1]
-    size = _permanent(*(edge[0] for edge in edges))
-    return value, np.abs(value) > _DOUBLED * size + _LEAST
-
-
-def _at(pair, k):
-    return pair[0][k], pair[1][k]
-
-
-def _minus(x):
-    return -x[0], -x[1]
-
-
-def _sum(a, b):
-    """A sum and what rounding took from it (Knuth)."""
-    total = a + b
-    of_b = total - a
-    return total, (a - (total - of_b)) + (b - of_b)
-
-
-def _difference(a, b):
-    return _sum(a, -b)
-
-
-def _product(a, b):
-    """A product and what rounding took from it (Dekker)."""
-    total = a * b
-    (high_a, low_a), (high_b, low_b) = _halves(a), _halves(b)
-    rest = high_a * high_b - total
-    rest += high_a * low_b
-    rest += low_a * high_b
-    rest += low_a * low_b
-    return total, rest
-
-
-def _halves(a):
-    scaled = 134217729.0 * a  # 2^27 + 1
-    high = scaled - (scaled - a)
-    return high, a - high
-
-
-def _plus(x, y):
-    total, rest = _sum(x[0], y[0])
-    return _sum(total, rest + (x[1] + y[1]))
-
-
-def _times(x, y):
-    total, rest = _product(x[0], y[0])
-    return _sum(total, rest + (x[0] * y[1] + x[1] * y[0]))
-
-
-def _whole_determinants(rows):
-    """Determinants of the differences to the first row, exact and then rounded; all are known."""
-    whole, exponent = _whole(rows)
-    found = _determinant(*(x - whole[0] for x in whole[1:]))
-    return _rounded(found, len(rows[1:]) * exponent), True
-
-
-def _whole_coefficient(rows, moves, order):
-    """The coefficient of eps^order of the determinants, exact but for a positive factor."""
-    whole, _ = _whole(rows)
-    push, _ = _whole(moves)
-    edges, turns = ([x - of[0] for x in of[1:]] for of in (whole, push))
-    total: np.ndarray = np.zeros(rows[0].shape[1], object)
-    for moved in range(1, 1 << len(edges)):
-        if moved.bit_count() == order:
-            part = [turns[k] if moved >> k & 1 else edges[k] for k in range(len(edges))]
-            total = total + _determinant(*part)
-    return np.array([(x > 0) - (x < 0) for x in total.tolist()], float)
-
-
-def _whole(rows):
-    """Numbers as Python's whole ones, in units of two to one exponent."""
-    mantissa, exponent = np.frexp(np.stack(rows))
-    mantissa = np.ldexp(mantissa, 53).astype(np.int64)
-    exponent = np.where(mantissa != 0, exponent - 53, np.iinfo(np.int32).max)
-    least = int(exponent.min(initial=0))
-    shift = np.where(mantissa != 0, exponent - least, 0)
-    whole = np.empty(mantissa.shape, object)
-    whole.ravel()[:] = [
-        m << s for m, s in zip(mantissa.ravel().tolist(), shift.ravel().tolist(), strict=True)
-    ]
-    return list(whole), least
-
-
-def _rounded(whole, exponent: int):
-    found = np.empty(len(whole))
-    for k, x in enumerate(whole.tolist()):
-        cut = max(abs(x).bit_length() - 62, 0)
-        found[k] = np.ldexp(float(x >> cut), cut + exponent)
-        if x and not found[k]:
-            found[k] = np.copysign(np.finfo(float).smallest_subnormal, x)
-    return found

@@ -1,0 +1,141 @@
+"""Pairs of triangles that share no vertex: those that may intersect, and those that may touch.
+
+By boxes first (`pair_boxes.py`), then by the planes of either (`pair_planes.py`), to rounding, and
+at last by signs that are exact.
+
+Solids that touch have thousands of pairs whose boxes share no more than a side: all of a lattice's
+that stand on each other. To tell each of them apart by signs that vanish costs more than all else.
+But the push that decides such signs (`predicates.py`) orders the vertices along each axis, too,
+those in one place by their pushes; and boxes of ranks in that order are those of the pushed
+surface, which has no contact. So where most boxes only touch, they are compared by rank: solids
+that stand on each other are told apart as groups, as if they were apart by a meter.
+"""
+
+from functools import cached_property
+from itertools import chain
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
+from spt_jax.overlap.triangles.pair_boxes import (
+    STEPS,
+    across_groups,
+    near_groups,
+    near_pairs,
+    parts_of_size,
+    ranked,
+    touching_share,
+    within_clusters,
+)
+from spt_jax.overlap.triangles.pair_layout import Prepared
+from spt_jax.overlap.triangles.pair_planes import not_apart
+from spt_jax.overlap.triangles.predicates import Predicates
+from spt_jax.overlap.triangles.warm_pairs import warm_pairs
+
+# Upper bound on face pairs that the plane of neither face separates. A mesh with more is noise, and
+# the list would exhaust memory: a body of 24,540 triangles has 1,800, with joints turned by 2 rad
+# at random 16,000, with every vertex moved by 5 mm at random 200,000, by 20 mm, a triangle's size,
+# 2,300,000.
+_MOST_PAIRS, _MOST_PAIRS_EACH = 2_000_000, 20
+# Of so many pairs at least, this part has to touch for ranks to be worth three sorts.
+_MANY, _TOUCHING = 1024, 0.1
+
+Pairs = list[tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]]
+
+
+class Entangled(ValueError):
+    """A mesh is so crumpled that its triangles' pairs cannot be listed."""
+
+
+class NearTriangles:
+    """Pairs of triangles near each other, of one shape of a mesh.
+
+    Attributes:
+        layout, shape: the triangles in their slots.
+
+    Args:
+        mesh: what is known of the faces.
+        predicates: the signs.
+        reach: how near to a triangle a vertex lies on it.
+        touching: only pairs with one of these faces are wanted; all if not given.
+    """
+
+    def __init__(
+        self,
+        mesh: Prepared,
+        predicates: Predicates,
+        reach: float,
+        touching: Bool[np.ndarray, "F"] | None = None,
+    ):
+        self._mesh, self._predicates, self._reach = mesh, predicates, reach
+        self.layout, self.shape, self._clusters, self._groups = near_groups(mesh, predicates.points)
+        self._touching = touching
+        self._near: list[Int[np.ndarray, "2 _"]] | None = None
+
+    def straddling(self) -> Pairs:
+        """Slots of the pairs each of which has corners on both sides of the other's plane.
+
+        Raises:
+            Entangled: they are too many to be listed.
+        """
+        found, self._near = self._found(self._by_place(), self._predicates.points.shape[1] < STEPS)
+        return self._found(self._by_rank(), False)[0] if self._near is None else found
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """The corners of triangles that lie on others."""
+        near = self._near
+        if near is None:
+            # Ranks told apart what touches.
+            near = (self._not_apart(t, u)[2] for t, u in self._by_place())
+        return contacts_of(self.layout, self.shape, near, self._reach)
+
+    def _by_place(self):
+        """Pairs whose boxes meet."""
+        parts = self.layout, self.shape, self._clusters, self._groups
+        if self._touching is not None:
+            return near_pairs(*parts, self._touching)
+        return warm_pairs(self._mesh, self._predicates.points, self._predicates.scale, *parts)
+
+    def _by_rank(self):
+        """Pairs whose boxes meet once vertices are moved along their pushes."""
+        layout = self.layout
+        shape, clusters, groups = ranked(self.shape, layout, self._predicates.ranks)
+        if self._touching is not None:
+            return near_pairs(layout, shape, clusters, groups, self._touching)
+        across = across_groups(layout, shape, clusters, groups)
+        return parts_of_size(chain(within_clusters(layout, shape), across))
+
+    def _found(self, pairs, if_few_touch: bool):
+        """The straddling ones, and those with a corner in the other's plane; None if given up."""
+        found, near, seen = [], [], 0
+        most = _MOST_PAIRS + _MOST_PAIRS_EACH * len(self.layout.slot)
+        for t, u in pairs:
+            if if_few_touch and len(t) >= _MANY and touching_share(self.shape, t, u) > _TOUCHING:
+                return found, None
+            t, u, in_plane = self._not_apart(t, u)
+            near.append(in_plane)
+            seen += len(t)
+            if seen > most:
+                raise Entangled(
+                    "vertices must be a surface whose triangles mostly lie apart: got more than "
+                    f"{most:,} pairs of {len(self.layout.slot):,} triangles that are near each "
+                    "other; look for coordinates that exploded or collapsed."
+                )
+            found.append(self._straddling(t, u))
+        return found, near
+
+    def _not_apart(self, t, u):
+        return not_apart(self.layout, self.shape, t, u, self._reach)
+
+    def _straddling(self, t, u):
+        corners, count = self.layout.corners, self._predicates.points.shape[1]
+        for turn in (0, 1):
+            x, y = (t, u) if turn else (u, t)
+            plane, corner = corners.take(y, axis=1), corners.take(x, axis=1)
+            key = y * count + corner
+            side, _ = self._predicates.volume(plane, corner, key, if_alike=True)
+            kept = np.flatnonzero(np.abs(side.sum(axis=0)) < 3)
+            t, u = t[kept], u[kept]
+        return t, u
