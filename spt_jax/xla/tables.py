@@ -1,6 +1,25 @@
 """What the device path knows from outside, as arrays: operands of its programs, never part of them.
 
-So programs are shared by calls that differ in directions, groups or distances alone.
+Programs are compiled for shapes alone, so calls that differ in directions, groups or distances
+share one. Every table is a look-up by face:
+
+    faces of a triangle pair        f                              g
+    GroupTable    is the pair       row[f] ------> ignored[.,.] <------ row[g]
+                  ignored?
+    PathTable     how far apart     rows[f, s] is the distance from f to seed s. Over any s, and
+                  at rest?          best over f's or g's nearest one,
+
+                                       f ---------------- g        |fs - sg| <= fg <= fs + sg
+                                         \             /           so 512 numbers a face stand for
+                                          s ---------'             distances of 300 million pairs
+
+    PlaceTable    do they fold?     where fg is smaller than distances[f] and distances[g]; in slim
+                                    limbs exactly, from a bit for each face that is near:
+                                    around[row[f], g / 8] has g's bit at 7 - g mod 8, as
+                                    `np.packbits` lays them
+
+Scenes of several copies of one rest surface use the tables of one: face f of the scene is face
+f mod F of copy f div F.
 """
 
 import functools

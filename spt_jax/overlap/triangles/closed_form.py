@@ -13,8 +13,18 @@ theorem in barycentric coordinates (u, v), with dF/du = lambda_t,
     integral of w lambda_t du dv = sum over the triangle's sides of the integral of w F dv
                                  + sum over the contour's segments of (w_left - w_right) F dv.
 
-w along a side is that at its start plus a jump wherever the side passes through a triangle, and F
-is quadratic, so Simpson's rule is exact: no subdivision is needed, however many sheets lie over
+For a triangle abc that another solid enters along the contour from s to e:
+
+              c
+             / \            Sides, w F dv:   a to b: w is 0 as far as e, where the side enters the
+            / 0 s                            solid, then 1; b to c: 1 as far as s, then 0; c to a:
+           /   / \                           0. Each side is taken from its corner's w, and each
+          /   / 1 \                          place that it passes through adds its jump times the
+         a---e-----b                         integral from there to the side's end (`_sides`).
+                            Contour, F dv:   s to e, once, as w is 1 on its left, 0 on its right.
+
+What is summed is the way around the part where w is 1: e to b to s to e. F is quadratic along a
+straight line, so Simpson's rule is exact: no triangle is ever cut, however many sheets lie over
 each other. The volume follows from the gradient, because it is homogeneous of degree three:
 3 E = sum of (x_t - center) . grad_t E.
 

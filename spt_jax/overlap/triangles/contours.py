@@ -1,4 +1,24 @@
-"""The intersection contours: segments along which pairs of triangles intersect."""
+"""The intersection contours: segments along which pairs of triangles intersect.
+
+Two triangles of a closed surface in general position that intersect do so along one segment, each
+end of which is where an edge of one passes through the other:
+
+        both ends on one triangle's edges          one end on each one's edges
+
+               ___________                                ____________
+              /     |    /                               /    |      /|
+             /   s==|=e /   the other one's two         /     |  s==/=|==e
+            /_______|__/    edges pass through it      /______|____/  |
+
+Where they share a vertex the segment starts there and has one such end (`cusp`).
+
+The segment runs along the first triangle's normal times the second's. Along its own edges,
+counter-clockwise, the first triangle enters the second's solid at the segment's end and leaves it
+at the segment's start; the second triangle the other way about. So on the first triangle the part
+that lies inside the second's solid is on the left of the segment, seen from outside, and on the
+second triangle the part inside the first's solid is on the right of it. `closed_form.py` and
+`winding.py` rest on this.
+"""
 
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,31 @@
 """Pairs of triangles whose boxes meet, by clusters of neighbours: the broad phase of `pairs.py`.
 
-The boxes of all clusters and of groups of them are refitted to the triangles at every call; which
-triangles make a cluster is kept in `pair_layout.py`.
+Three levels of boxes, each around the eight below it:
+
+    group       [                                               ]    8 clusters
+    cluster     [     ][     ][     ][     ][     ][    ][      ]    8 triangles
+    triangle    ........ ........ ........ ........ ........ ...
+
+Groups are sorted along the longest axis and swept (`meeting_boxes`). Of two groups that meet, the
+clusters that reach the other group's box are compared with all clusters of it, and the same again
+for triangles. Of a posed body's 300 million pairs of triangles, 210,000 are compared one by one.
+Which triangles make a cluster is kept in `pair_layout.py`; the boxes are fitted to the triangles at
+every call.
+
+A box is compared as two words, not as six numbers. Three coordinates of 20 bits, each with a guard
+bit above it, make a word of 63 bits:
+
+    | guard | x, 20 bits | guard | y, 20 bits | guard | z, 20 bits |
+
+With the guards of the minuend set, one subtraction compares three coordinates, because a field that
+would fall below zero borrows its own guard, and no other field's:
+
+    high 7, other's low 5:  1 0111 - 0101 = 1 0010   the guard stands: high >= low
+    high 7, other's low 9:  1 0111 - 1001 = 0 1110   it is gone:       high <  low
+
+Two boxes meet where all six guards stand after two subtractions (`_meet`). Coordinates are rounded
+outwards to whole numbers, so boxes that meet are never missed; some that are apart by less than
+a step are kept, and fall to the next test.
 """
 
 from collections.abc import Iterable, Iterator

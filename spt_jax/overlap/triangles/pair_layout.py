@@ -1,4 +1,23 @@
-"""What the search for crossing triangles keeps about a list of faces from one call to the next."""
+"""What the search for intersecting triangles keeps about a list of faces from one call to the next.
+
+The topology follows from the faces alone. The layout puts triangles that lie near each other into
+slots side by side, eight to a cluster and eight clusters to a group, so that whatever is done with
+a cluster is done with one row of an array. It halves the faces along the longest side of the box
+around their centers, again and again:
+
+    faces    0 ....................................................... F
+             |           whole groups           |  the rest, a group in part
+             |        left       |     right    |
+             |  64   |  64   |   |  64   |      |                 until groups are left, then
+             |8|8|8|8|8|8|8|8|                                    until clusters are left
+
+The left half takes half of the groups (then of the clusters), rounded up, so that only the last one
+has empty slots. All ranges of one depth are sorted by one `lexsort`. Triangles 64 times as large as
+the usual one, or 512 times, are laid out by themselves: one of them would blow up the box of its
+cluster. Centers are taken from all the shapes in which the mesh was seen, because neighbours in one
+pose may be strewn over another; `pair_boxes.near_groups` asks for another layout where the last one
+suits a shape no more. `tests/helpers_reference.py` has the halving as a recursion.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -163,7 +182,6 @@ def _arrange(topology: Topology, boxes: list[Float[np.ndarray, "F 6"]]) -> Layou
     faces = topology.faces
     place = np.concatenate([box[:, :3] + box[:, 3:] for box in boxes], axis=1).T
     size = (boxes[-1][:, 3:] - boxes[-1][:, :3]).max(axis=1)
-    # A triangle eight times the usual size would blow up the box of any cluster it is put into.
     usual = np.median(size)
     step = np.log(np.maximum(size, 8 * usual)) if usual > 0 else np.zeros(len(size))
     group = np.floor((step - step.min()) / np.log(8)).astype(np.int64)

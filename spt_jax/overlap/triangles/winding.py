@@ -1,14 +1,43 @@
 """The winding number just outside the surface, everywhere along it, from one place of each part.
 
-Along the surface the winding number just outside it changes only where the surface passes through
-itself: an edge that enters another solid gains one, an edge that leaves loses one. So it is known
-at all vertices once it is known at one vertex of every connected part. That vertex is the one
-farthest along x: no triangle of its own part lies beyond it, so a ray along x from there meets only
-other parts, and whether the part is inside out the edges there tell. Every sign is exact, and of
-one surface in general position, so the numbers fit together; that they do is checked.
+The winding number w of a place is how many solids it lies in, one that is inside out taking one
+away. Walk along the surface just outside it: w changes only where the surface passes through
+itself. An edge that enters another solid gains one, an edge that leaves it loses one.
 
-What counts may be chosen by pairs of parts: a crossing of two parts that do not count is no jump,
-and such a part is not seen by the ray. Several choices, called layers, are worked out together.
+        0   +-----------+
+            | A         |  0        Down the right side of A, w is 0 as far as the x, where the
+            |      +----x------+    edge enters B, and 1 below it. Then left along the lower side,
+            |      | 1  | 1    |    w is 1 as far as the other x, where the edge leaves B, and 0
+            +------x----+      |    beyond it. B is told by the same two places.
+                   |         B |
+                   +-----------+
+
+So all is known once w is known at one vertex of each connected part:
+
+1. Edges through which nothing passes join vertices to patches of one w (`Blocks.patches`).
+2. Every other edge links the patches of its ends; its step is the sum of its jumps.
+3. Each part has a root, its vertex farthest along x. No triangle of the part lies beyond, so w is
+   0 there, or -1 where the part is inside out, as the edges there tell; and every other solid
+   in which it lies adds one, as a ray along x tells, which meets only other parts.
+4. From the roots w spreads along the links. A link that joins two known patches is a check: the
+   steps around every loop must cancel (`Ends.fits`).
+
+Every sign is exact, and of one surface in general position, so they do cancel, unless the surface
+is not closed.
+
+At a cusp, a vertex two of whose own triangles intersect, w differs from edge to edge. The triangles
+around it, cut by a small sphere, make a closed curve that crosses itself:
+
+          _____
+         /     \      Going round the vertex from corner to corner, w steps where the segment of
+         \      \     two such triangles starts within a corner. So each edge has a node of its
+      ____\__    |    own there, and corners are links as well.
+     /     \ \__/
+     \______\         (`_around_cusps`)
+
+What counts may be chosen by pairs of parts: an edge of a part that enters another one makes no
+step where the two do not count, and the ray does not see such a part. Several choices, called
+layers, are worked out together. `tests/helpers_reference.py` has all of this in forty slow lines.
 """
 
 from dataclasses import dataclass
