@@ -1,4 +1,4 @@
-"""The overlap volume and its gradient in closed form, at any depth.
+r"""The overlap volume and its gradient in closed form, at any depth.
 
 Each pair of solids that overlap in a place counts once there: with the winding number w,
 

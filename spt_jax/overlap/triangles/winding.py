@@ -1,4 +1,4 @@
-"""The winding number just outside the surface, everywhere along it, from one place of each part.
+r"""The winding number just outside the surface, everywhere along it, from one place of each part.
 
 The winding number w of a place is how many solids it lies in, one that is inside out taking one
 away. Walk along the surface just outside it: w changes only where the surface passes through
