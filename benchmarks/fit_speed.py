@@ -1,6 +1,6 @@
 """What a fit to keypoints costs: `python -m benchmarks.fit_speed`.
 
-One person at a time against all in one call, with the default regulariser, on scenes of
+One person at a time against all in one call, with the default regularizer, on scenes of
 `pose_scenes.py` with noise: some of them collide on the way, most do not.
 """
 
@@ -15,6 +15,7 @@ import tyro
 from benchmarks.common import Table, provenance, record_section
 from benchmarks.pose_scenes import camera, scenes
 from spt_jax import fit_pose, load_body
+from spt_jax.fit import Start
 
 _MEGABYTE = 1024  # in the kilobytes of getrusage
 
@@ -38,32 +39,32 @@ def measured(settings: Settings) -> list[list[str]]:
     seen = np.stack([scene.seen for scene in some])
     shapes = np.stack([scene.shape for scene in some])
 
-    def fit(rows, regulariser):
+    def fit(rows, regularizer):
         found = fit_pose(
             body,
             points[rows],
             camera(),
             layout="smpl",
             confidence=seen[rows],
-            shape=shapes[rows],
-            regulariser=regulariser,
+            start=Start(shape=shapes[rows]),
+            regularizer=regularizer,
         )
         jax.block_until_ready(found.pose)
 
-    def timed(rows, regulariser):
+    def timed(rows, regularizer):
         start = time.perf_counter()
-        fit(rows, regulariser)
+        fit(rows, regularizer)
         return time.perf_counter() - start
 
     table, before = [], memory()
-    for regulariser in ("none", "spt"):
-        first = timed(0, regulariser)
-        singles = [timed(row, regulariser) for row in range(settings.people)]
-        table.append(_row(f"one person, {regulariser}", first, singles, 1, before))
+    for regularizer in ("none", "spt"):
+        first = timed(0, regularizer)
+        singles = [timed(row, regularizer) for row in range(settings.people)]
+        table.append(_row(f"one person, {regularizer}", first, singles, 1, before))
         whole = slice(None)
-        first = timed(whole, regulariser)
-        batches = [timed(whole, regulariser) for _ in range(settings.repeats)]
-        name = f"{settings.people} in one call, {regulariser}"
+        first = timed(whole, regularizer)
+        batches = [timed(whole, regularizer) for _ in range(settings.repeats)]
+        name = f"{settings.people} in one call, {regularizer}"
         table.append(_row(name, first, batches, settings.people, before))
         share = np.median(batches) / np.sum(singles)
         table.append(

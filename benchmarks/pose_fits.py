@@ -14,12 +14,15 @@ import optimistix as optx
 
 from benchmarks.pose_scenes import Scene, camera, prior_without
 from spt_jax import BodyModel, classify_vertices, fit_pose, load_body
-from spt_jax.fit.terms.regularisers import (
+from spt_jax.fit import (
     Laplacian,
     Nothing,
-    Regulariser,
+    Regularizer,
     SelfIntersection,
     Spheres,
+    Stages,
+    Start,
+    Terms,
 )
 
 RISE = (0.01, 0.1, 1.0)  # of each method's weight, stage by stage
@@ -60,7 +63,7 @@ class Fitter:
     weight: float
     body: BodyModel = field(default_factory=load_body)
 
-    def regulariser(self) -> Regulariser:
+    def regularizer(self) -> Regularizer:
         """The method's term, its weight rising over the same stages for all."""
         weights = tuple(self.weight * share for share in RISE)
         if self.method == "RE":
@@ -92,16 +95,20 @@ class Fitter:
             camera(),
             layout="smpl",
             confidence=None if exact else np.stack([scene.seen for scene in some]),
-            shape=np.stack([scene.shape for scene in some]),
-            regulariser=self.regulariser(),
-            # Its mean is where the search starts, whatever it weighs.
-            prior=prior_without(some[0].motion),
-            prior_weight=0.0 if plain else 1.0,
-            limits=None if plain else "anatomical",
-            upright_weight=0.0 if plain else 0.25,
-            solver=optx.GradientDescent(PAPER_RATE, rtol=1e-3, atol=1e-3)
-            if self.method.endswith("paper")
-            else None,
+            start=Start(shape=np.stack([scene.shape for scene in some])),
+            terms=Terms(
+                # Its mean is where the search starts, whatever it weighs.
+                prior=prior_without(some[0].motion),
+                prior_weight=0.0 if plain else 1.0,
+                limits=None if plain else "anatomical",
+                upright_weight=0.0 if plain else 0.25,
+            ),
+            regularizer=self.regularizer(),
+            stages=Stages(
+                optx.GradientDescent(PAPER_RATE, rtol=1e-3, atol=1e-3)
+                if self.method.endswith("paper")
+                else None
+            ),
         )
 
 

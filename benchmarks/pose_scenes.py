@@ -12,7 +12,8 @@ import numpy as np
 from benchmarks.oracles import RestGraph, far_crossings
 from spt_jax import BodyModel, PinholeCamera, load_body, load_mocap, self_intersection_penalty
 from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from spt_jax.fit.terms.priors import GaussianPosePrior, pose_prior
+from spt_jax.fit.problem.learned_priors import pose_prior
+from spt_jax.fit.problem.priors import GaussianPosePrior
 
 JOINTS = 22
 FOCAL, CENTER = 1200.0, (500.0, 500.0)  # pixels; a person of 1.7 m is 400 to 680 pixels tall

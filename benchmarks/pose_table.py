@@ -2,7 +2,7 @@
 
 Poses are fitted to 22 projected joints by each method, all from the same starts and with the same
 numbers of steps; `pose_scenes.py` says what the scenes are, `pose_fits.py` what the methods are.
-Once the objective is the paper's, the keypoints and the regulariser alone, and once it has what
+Once the objective is the paper's, the keypoints and the regularizer alone, and once it has what
 `fit_pose` adds by default, a prior (of the other motions) and joint limits. `--tune` fits other
 scenes with rising weights; those in `pose_fits.WEIGHTS` are the best that it found for each method.
 """

@@ -30,6 +30,7 @@ if typing.TYPE_CHECKING:
     from spt_jax._result import Overlap as Overlap
     from spt_jax._settings import config as config
     from spt_jax._status import RESULTS as RESULTS
+    from spt_jax._steps import Step as Step
     from spt_jax.body import BodyModel as BodyModel
     from spt_jax.body import PosedBody as PosedBody
     from spt_jax.body import RigModel as RigModel
@@ -53,7 +54,6 @@ if typing.TYPE_CHECKING:
     from spt_jax.untangle.motion import untangle_motion as untangle_motion
     from spt_jax.untangle.pose import UntangleResult as UntangleResult
     from spt_jax.untangle.pose import untangle_pose as untangle_pose
-    from spt_jax.untangle.steps import Step as Step
 
 try:
     __version__ = importlib.metadata.version("spt-jax")
@@ -139,7 +139,7 @@ __getattr__, __dir__ = _lazy_names(
         "Penetration": "spt_jax.fit.people",
         "PeopleResult": "spt_jax.fit.people",
         "RESULTS": "spt_jax._status",
-        "Step": "spt_jax.untangle.steps",
+        "Step": "spt_jax._steps",
         "UntangleMeshResult": "spt_jax.untangle.mesh",
         "UntangleResult": "spt_jax.untangle.pose",
         "fit_people": "spt_jax.fit.people",

@@ -9,10 +9,12 @@ from helpers import embedded_body, mocap
 
 from spt_jax import PinholeCamera, keypoint_regressor
 from spt_jax.body import BodyModel
-from spt_jax.fit.figure import Variables, make_figure
-from spt_jax.fit.objective import Objective, Weights, as_seen
-from spt_jax.fit.terms.priors import joint_limits, pose_prior
-from spt_jax.fit.viewer import Viewer
+from spt_jax.fit.problem.figure import make_figure
+from spt_jax.fit.problem.learned_priors import pose_prior
+from spt_jax.fit.problem.limits import joint_limits
+from spt_jax.fit.problem.objective import Objective, Weights, as_seen
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.fit.problem.viewer import Viewer
 
 # World with y up, and a camera that looks along -z from 4 m away, a metre above the floor.
 UPRIGHT = np.diag([1.0, -1.0, -1.0])

@@ -3,9 +3,10 @@
 import inspect
 import typing
 
-from spt_jax import fit_pose, self_intersection_penalty
+from spt_jax import fit as public
+from spt_jax import self_intersection_penalty
 from spt_jax.cli.fit import fit
-from spt_jax.fit.terms.regularisers import NAMED, SelfIntersection
+from spt_jax.fit import Regularizer, SelfIntersection, as_regularizer, regularizer_names
 from spt_jax.overlap.measure import Value
 
 
@@ -17,9 +18,14 @@ def choices(function, name):
     return {choice for literal in literals for choice in typing.get_args(literal)}
 
 
-def test_regularisers_have_the_same_names_everywhere():
-    assert choices(fit_pose, "regulariser") == choices(fit, "regulariser") == NAMED.keys()
-    assert all(NAMED[name]().name == name for name in NAMED)
+def test_regularizers_have_the_same_names_everywhere():
+    names = regularizer_names()
+    assert choices(fit, "regularizer") == set(names)
+    found = {type(as_regularizer(name)) for name in names}
+    assert [as_regularizer(name).name for name in names] == list(names)
+    exported = {getattr(public, name) for name in public.__all__}
+    kinds = {kind for kind in exported if isinstance(kind, type) and issubclass(kind, Regularizer)}
+    assert found == kinds - {Regularizer}
 
 
 def test_criteria_have_the_same_names_everywhere():

@@ -4,7 +4,7 @@ import json as json_format
 import time
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import tyro
 
@@ -16,6 +16,12 @@ from spt_jax.cli.terminal import (
     show,
     user_errors,
 )
+from spt_jax.fit.regularizers import regularizer_names
+
+if TYPE_CHECKING:
+    RegularizerName: TypeAlias = str
+else:  # so that the help lists them
+    RegularizerName = Literal[regularizer_names()]
 
 
 def fit(
@@ -28,7 +34,7 @@ def fit(
     image: Path | None = None,
     people: str = "all",
     body: str = "anny",
-    regulariser: Literal["spt", "none", "spheres", "laplacian"] = "spt",
+    regularizer: RegularizerName = "spt",
     fold_distance: float | None = None,
     robust: float | Literal["auto", "off"] = "auto",
     fit_shape: bool = False,
@@ -61,7 +67,7 @@ def fit(
         people: which people: rows from 0, ranges, images and names, such as 0,3-5 or 000000000139
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
             (.npz, .pkl).
-        regulariser: what keeps a body from passing through itself: the self-intersection penalty,
+        regularizer: what keeps a body from passing through itself: the self-intersection penalty,
             nothing, or the paper's rivals.
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold and does not count; not given: as near as the place allows, 0.3 on trunk and
@@ -130,7 +136,7 @@ def fit(
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
         options = {
-            "regulariser": regulariser,
+            "regularizer": regularizer,
             "fold_distance": fold_distance,
             "robust": robust,
             "fit_shape": fit_shape,

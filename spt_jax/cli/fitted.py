@@ -13,7 +13,7 @@ from spt_jax._report import IntersectionReport
 from spt_jax._status import OUTSIDE, RESULTS, names_of
 from spt_jax.cli.annotated import Annotated
 from spt_jax.cli.frames import versions
-from spt_jax.fit import photograph
+from spt_jax.fit.problem import photograph
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from spt_jax.body import BodyModel
     from spt_jax.cli.unfinished import UnfinishedRun
 
-Named = Literal["spt", "none", "spheres", "laplacian"]
 Robust = float | Literal["auto", "off"]
 
 # Detectors make mistakes, and a square counts one of them for more than all the rest. Mean joint
@@ -66,7 +65,7 @@ def fit_everyone(
     body: "BodyModel",
     groups: Sequence[Sequence[Annotated]],
     *,
-    regulariser: Named,
+    regularizer: str,
     fold_distance: float | None = None,
     robust: Robust,
     fit_shape: bool,
@@ -85,9 +84,11 @@ def fit_everyone(
     from spt_jax._exclusions import as_fold_surface
     from spt_jax.fit import people as scenes
     from spt_jax.fit import pose as fitting
-    from spt_jax.fit.terms.regularisers import SelfIntersection, as_regulariser
+    from spt_jax.fit.options import Scene, Start, Terms
+    from spt_jax.fit.regularizers import as_regularizer
+    from spt_jax.fit.regularizers.spt import SelfIntersection
 
-    term = as_regulariser(regulariser)
+    term = as_regularizer(regularizer)
     if isinstance(term, SelfIntersection):
         term = dataclasses.replace(term, fold_distance=fold_distance)
     prepared = term.prepared(body, 1)
@@ -109,14 +110,17 @@ def fit_everyone(
         options: dict[str, Any] = {
             "layout": group[0].person.layout,
             "confidence": np.stack([one.person.confidence for one in group]).astype(np.float32),
-            "regulariser": prepared,
-            "robust": _robust_scales(group, robust),
-            "fit_shape": fit_shape,
+            "regularizer": prepared,
+            "start": Start(fit_shape=fit_shape),
         }
+        scales = _robust_scales(group, robust)
         points = np.stack([one.person.points for one in group]).astype(np.float32)
         scene = None
         if len(group) > 1:
-            options["fold_distance"] = fold_distance
+            options |= {
+                "terms": Terms(robust=scales),
+                "scene": Scene(fold_distance=fold_distance),
+            }
             together = scenes.fit_people(body, points, group[0].camera, **options)
             results = together.people
             scene = {
@@ -126,8 +130,10 @@ def fit_everyone(
                 "after": together.after.as_dict(),
             }
         else:
-            each = ("confidence", "robust")
-            options |= {k: options[k] if options[k] is None else options[k][0] for k in each}
+            options |= {
+                "confidence": options["confidence"][0],
+                "terms": Terms(robust=None if scales is None else scales[0]),
+            }
             result = fitting.fit_pose(body, points[0], group[0].camera, **options)
             results = jax.tree.map(lambda leaf: leaf[None], result)
         results = jax.tree.map(np.asarray, results)

@@ -84,9 +84,9 @@ def untangle_frames(
     """
     from spt_jax._exclusions import as_fold_surface
     from spt_jax._report import intersection_report
+    from spt_jax._steps import Step
     from spt_jax.cli.kept import frame_arrays, frame_of
     from spt_jax.untangle.pose import untangle_pose
-    from spt_jax.untangle.steps import Step
 
     rest = as_fold_surface(body, fold_distance) if folds == "ignore" else None
     asked = {"rays": rays, "directions": directions, "rest_surface": rest}

@@ -57,8 +57,8 @@ def untangle_mesh_file(
         show(err_console(quiet), f"note: {note}", "yellow")
     start = time.perf_counter()
     with progress_bar(1, quiet) as state:
+        from spt_jax._steps import Step
         from spt_jax.untangle.mesh import untangle_mesh
-        from spt_jax.untangle.steps import Step
 
         def on_step(step: Step) -> None:
             pairs = f"{step.intersecting_pairs} intersecting pairs"

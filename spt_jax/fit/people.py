@@ -1,7 +1,7 @@
 """Several people in one scene, fitted together."""
 
 import dataclasses
-import inspect
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,18 +13,21 @@ from jaxtyping import Array, Float, Int
 from spt_jax._camera import PinholeCamera
 from spt_jax._exclusions import as_fold_surface
 from spt_jax._groups import between_groups, join_bodies, within_groups
-from spt_jax._query import as_margin
 from spt_jax._report import intersection_report
 from spt_jax._result import Result, plain
 from spt_jax._status import RESULTS
+from spt_jax._steps import OnStep, Step
 from spt_jax.body import BodyModel
-from spt_jax.fit.inputs import Person
-from spt_jax.fit.pose import fit_pose
+from spt_jax.fit.options import Numbers, Scene, Search, Stages, Start, Terms
+from spt_jax.fit.pose import fit_each
+from spt_jax.fit.problem.inputs import Keypoints, Person
 from spt_jax.fit.programs import program
+from spt_jax.fit.regularizers._base import Regularizer
+from spt_jax.fit.regularizers.spt import SelfIntersection
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.setup import Setup, prepare_fit
 from spt_jax.fit.stages import descend
-from spt_jax.fit.terms.regularisers import SelfIntersection, as_weights
+from spt_jax.keypoints import AnyLayout
 from spt_jax.overlap.measure import Unmeasurable
 from spt_jax.rest.surface import RestSurface
 
@@ -101,15 +104,18 @@ class PeopleResult(Result):
 
 def fit_people(
     body: BodyModel,
-    keypoints: Any,
+    keypoints: Keypoints,
     camera: PinholeCamera,
     *,
-    layout: Any,
-    weights: Any = (0.01, 0.1, 1.0, 10.0, 100.0),
-    margin: float = 0.002,
-    fold_distance: float | None = None,
-    max_steps: int = 25,
-    **options: Any,
+    layout: AnyLayout | None = None,
+    confidence: Numbers | None = None,
+    start: Start = Start(),
+    terms: Terms = Terms(),
+    regularizer: str | Regularizer = "spt",
+    search: Search = Search(),
+    stages: Stages = Stages(),
+    scene: Scene = Scene(),
+    on_step: OnStep | None = None,
 ) -> PeopleResult:
     """People who share a scene, fitted so that they intersect neither each other nor themselves.
 
@@ -120,23 +126,21 @@ def fit_people(
 
     Args:
         body: any `BodyModel`.
-        keypoints: pixels, (N, K, 2), or a list of N people.
+        keypoints: pixels, (N, K, 2), a list of N people, or people of `read_keypoints`.
         camera: the one that sees them all.
-        layout: what the keypoints are, as in `fit_pose`.
-        weights: of the overlap in cm^3, one for each stage of the scene.
-        margin: how far apart surfaces are pushed, in metres.
-        fold_distance: how near to each other, along the rest surface and in metres, sheets of one
-            body are folds; None: the body's own distances, place by place.
-        max_steps: of each stage.
-        options: of `fit_pose`, by name: confidence, shape, prior and so on; `regulariser` is what
-            each person is fitted with alone.
+        layout, confidence, start, terms, search: as in `fit_pose`.
+        regularizer, stages: of the fits of each person alone, as in `fit_pose`.
+        scene: weights, margin and solver of the fit of all people together.
+        on_step: called with a `spt_jax.Step` of all bodies, one after another in its vertices,
+            once each of them was fitted alone, stage 0, and after each stage of the scene; what it
+            raises ends the fit.
 
     Returns:
         PeopleResult. Of all stages it keeps the one with the fewest intersecting pairs between
         people, then within, then the least overlap.
 
     Raises:
-        TypeError, ValueError: as `fit_pose`; keypoints of another shape; an unknown option.
+        TypeError, ValueError: as `fit_pose`; keypoints of another shape, or traced.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
 
@@ -152,52 +156,84 @@ def fit_people(
         >>> int(fit.after.intersecting_pairs_between)
         0
     """
-    known = inspect.signature(fit_pose).parameters
-    for name in options:
-        if name not in known or name in ("body", "keypoints", "camera", "layout", "max_steps"):
-            raise TypeError(
-                f"fit_people() takes the options of fit_pose: got an unexpected {name!r}."
-            )
-    if isinstance(keypoints, Tracer):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(keypoints)):
         raise TypeError(
             "keypoints must be known: got a traced array; fit_people decides by the values that "
             "it sees, so call it outside jit, vmap and grad."
         )
-    options = {"layout": layout, "max_steps": max_steps, **options}
-    alone = fit_pose(body, keypoints, camera, **options)
-    if alone.pose.ndim != 3:
-        raise ValueError(
-            f"keypoints must have shape (N, K, 2), one scene: got {np.shape(keypoints)}; fit "
-            "scenes one after another."
-        )
-    count = len(alone.pose)
-    gap = as_margin(margin)
-    defaults = {name: p.default for name, p in known.items() if p.default is not p.empty}
-    rest = as_fold_surface(body, fold_distance)
-    scene = SelfIntersection(weights, margin=jnp.asarray(gap), fold_distance=fold_distance)
-    setup, people, _ = prepare_fit(
-        body, keypoints, camera, **{**defaults, **options, "regulariser": scene}, in_scene=count
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a spt_jax.fit.Scene: got {type(scene).__name__}.")
+    given = partial(
+        prepare_fit,
+        body,
+        keypoints,
+        camera,
+        layout=layout,
+        confidence=confidence,
+        start=start,
+        terms=terms,
+        search=search,
     )
-    best, before = alone, _penetration(body, alone, rest)
-    after, steps = before, jnp.array(0)
-    rising = list(as_weights(weights)[:, None])
+    single, people, batch = given(regularizer=regularizer, stages=stages)
+    if len(batch) != 1:
+        raise ValueError(
+            f"keypoints must have shape (N, K, 2), one scene: got a batch of {batch}; fit scenes "
+            "one after another."
+        )
+    alone = fit_each(single, people)
+    together = SelfIntersection(
+        scene.weights, margin=jnp.asarray(scene.margin), fold_distance=scene.fold_distance
+    )
+    descent = Stages(scene.solver, scene.max_steps)
+    setup, people, _ = given(regularizer=together, stages=descent, in_scene=batch[0])
+    return _settle(setup, people, alone, scene, on_step)
+
+
+def _settle(
+    setup: Setup, people: Person, alone: FitResult, scene: Scene, on_step: OnStep | None
+) -> PeopleResult:
+    """Descend stage by stage, with a wider margin where people still intersect."""
+    rest = as_fold_surface(setup.body, scene.fold_distance)
+    best, before = alone, _penetration(setup.body, alone.vertices, rest)
+    after, steps, count = before, jnp.array(0), 0
+    _tell(on_step, setup.body, rest, count, 0, best)
+    rising = list(setup.regularizer.weights[:, None])
+    gap = scene.margin
     attempts = [(gap, rising)] + [(gap * more, rising[-1:]) for more in _WIDER if gap]
     for attempt, stages in attempts:
         fits = best
         for weight in stages:  # one stage a call: all are one program
             changed = dataclasses.replace(
-                setup.regulariser, margin=jnp.asarray(attempt), weights=weight
+                setup.regularizer, margin=jnp.asarray(attempt), weights=weight
             )
             fits, taken = _descend_together(
-                dataclasses.replace(setup, regulariser=changed), people, fits
+                dataclasses.replace(setup, regularizer=changed), people, fits
             )
-            steps = steps + taken
-        found = _penetration(body, fits, rest)
+            steps, count = steps + taken, count + 1
+            _tell(on_step, setup.body, rest, count, int(steps), fits)
+        found = _penetration(setup.body, fits.vertices, rest)
         if _rank(found) < _rank(after):
             best, after = fits, found
         if not any(_rank(after)[:2]):
             break
     return PeopleResult(people=best, before=before, after=after, steps=steps)
+
+
+def _tell(
+    on_step: OnStep | None, body: BodyModel, rest: RestSurface, stage: int, taken: int, fits
+) -> None:
+    if on_step is None:
+        return
+
+    def volume_and_pairs() -> tuple[float, int]:
+        found = _penetration(body, fits.vertices, rest)
+        volume = float(found.volume_between) + float(found.volume_within)
+        if not np.isfinite(volume):
+            return volume, -1
+        return volume, int(found.intersecting_pairs_between + found.intersecting_pairs_within)
+
+    vertices = np.asarray(fits.vertices).reshape(-1, 3)
+    on_step(Step(stage, taken, vertices, None, volume_and_pairs))
 
 
 @program
@@ -210,7 +246,7 @@ def _descend_together(
             one.start._replace(pose=pose, shape=shape, translation=translation)
         )
     )(objectives, fits.pose, fits.shape, fits.translation)
-    end = descend(setup.regulariser, setup.body, objectives, vectors, setup.solver, setup.max_steps)
+    end = descend(setup.regularizer, setup.body, objectives, vectors, setup.solver, setup.max_steps)
 
     def each(objective, vector, steps):
         return fit_result(setup.body, objective, vector, {}, end.converged, steps)
@@ -219,9 +255,11 @@ def _descend_together(
     return found, end.steps
 
 
-def _penetration(body: BodyModel, fits: FitResult, rest: RestSurface) -> Penetration:
-    scene = join_bodies(fits.vertices, body.faces)
-    count = len(fits.vertices)
+def _penetration(
+    body: BodyModel, vertices: Float[Array, "N V 3"], rest: RestSurface
+) -> Penetration:
+    scene = join_bodies(vertices, body.faces)
+    count = len(vertices)
     rest = rest if count == 1 else rest.copies(count)
     found = {}
     for name, ignored in (("between", within_groups(count)), ("within", between_groups(count))):

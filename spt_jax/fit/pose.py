@@ -1,53 +1,47 @@
 """A body's pose from keypoints in one image."""
 
-from typing import Any, Literal
+import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from spt_jax._camera import PinholeCamera
+from spt_jax._report import intersection_report
+from spt_jax._steps import OnStep, Step
 from spt_jax.body import BodyModel
-from spt_jax.fit.inputs import Person
+from spt_jax.fit.options import Numbers, Search, Stages, Start, Terms
+from spt_jax.fit.problem.inputs import Keypoints, Person
+from spt_jax.fit.problem.objective import Objective
 from spt_jax.fit.programs import program
+from spt_jax.fit.regularizers._base import Regularizer
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.search.candidates import Candidates
-from spt_jax.fit.setup import Search, Setup, prepare_fit
-from spt_jax.fit.stages import descend, unpacked
-from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits
-from spt_jax.fit.terms.regularisers import Regulariser
+from spt_jax.fit.setup import KeypointSearch, Setup, prepare_fit
+from spt_jax.fit.stages import Descent, descend, unpacked
+from spt_jax.keypoints import AnyLayout
+from spt_jax.overlap.measure import Unmeasurable
 
-# Candidates whose energy is looked at before two of them go through the regularised stages.
+# Candidates whose energy is looked at before two of them go through the regularized stages.
 _LOOKED_AT = 4
 
 
 def fit_pose(
     body: BodyModel,
-    keypoints: Any,
+    keypoints: Keypoints,
     camera: PinholeCamera,
     *,
-    layout: Any,
-    confidence: Any = None,
-    regulariser: Literal["spt", "none", "laplacian", "spheres"] | Regulariser = "spt",
-    pose: Any = None,
-    shape: Any = None,
-    translation: Any = None,
-    fit_shape: bool = False,
-    fit_translation: bool = True,
-    prior: Literal["mocap"] | GaussianPosePrior | None = "mocap",
-    limits: Literal["anatomical"] | JointLimits | None = "anatomical",
-    prior_weight: float = 1.0,
-    limits_weight: float = 1.0,
-    shape_weight: float = 1.0,
-    upright_weight: float = 0.25,
-    expected_error: Any = None,
-    robust: Any = None,
-    starts: int = 6,
-    solver: optx.AbstractMinimiser | None = None,
-    keypoint_solver: optx.AbstractMinimiser | None = None,
-    max_steps: int = 20,
+    layout: AnyLayout | None = None,
+    confidence: Numbers | None = None,
+    start: Start = Start(),
+    terms: Terms = Terms(),
+    regularizer: str | Regularizer = "spt",
+    search: Search = Search(),
+    stages: Stages = Stages(),
+    on_step: OnStep | None = None,
 ) -> FitResult:
     """Find the pose of a body that matches keypoints in an image and does not intersect itself.
 
@@ -57,12 +51,12 @@ def fit_pose(
         + prior weight * squared Mahalanobis distance of the pose from the prior
         + limits weight * sum of (angle beyond a joint's range / 0.1 rad)^2
         + shape weight * |shape|^2 + upright weight * |body's up - image's up|^2
-        + the regulariser's last weight * its energy
+        + the regularizer's last weight * its energy
 
-    first without the regulariser, from `starts` orientations and then through the depth flips of
-    each limb (a bone that leans towards the camera and its mirror image that leans away look the
-    same); then with it, its weight rising from stage to stage, from the two best of these, one
-    of them chosen with the regulariser in view. What ends with the lowest total is returned.
+    first without the regularizer, from `search.starts` orientations and then through the depth
+    flips of each limb (a bone that leans towards the camera and its mirror image that leans away
+    look the same); then with it, its weight rising from stage to stage, from the two best of these,
+    one of them chosen with the regularizer in view. What ends with the lowest total is returned.
     All of it is compiled. The people of a batch are solved one after another, so that
     each ends when it is done; under `vmap` they are solved side by side. Other numbers of any kind
     do not compile anew; other counts, options and layouts do.
@@ -70,45 +64,32 @@ def fit_pose(
     Args:
         body: any `BodyModel`.
         keypoints: pixels, x to the right and y down, (..., K, 2); or a list of people, each
-            (K, 2). People are fitted side by side and do not see each other: `fit_people` is for
-            those. A point whose confidence is 0 may be anything, NaN too.
+            (K, 2); or people of `read_keypoints`, one or a list, who know their layout and
+            confidences. People are fitted side by side and do not see each other: `fit_people` is
+            for those. A point whose confidence is 0 may be anything, NaN too.
         camera: a `PinholeCamera`; with one that has no rotation the body comes back in the
             camera's axes.
         layout: what the K keypoints are: "coco17", "body25", "h36m17", "smpl", or whatever
-            `keypoint_regressor` takes.
+            `keypoint_regressor` takes; left out for people of `read_keypoints`.
         confidence: (..., K), 0 for a point that was not seen; all 1 if None.
-        regulariser: "spt", the self-intersection penalty; "none"; "spheres" and "laplacian", the
-            rivals of the paper's section 4.4; or a `Regulariser` with weights of its own.
-        pose: where to start, (..., J, 3); then no other orientations and flips are tried. Give the
-            translation, too: it starts at zero otherwise.
-        shape: coefficients, (..., B); held fixed, or with `fit_shape` where to start.
-        translation: in metres, (..., 3); held fixed without `fit_translation`, else found from the
-            keypoints, or where to start if `pose` is given too.
-        fit_shape: whether to fit the shape.
-        fit_translation: whether to fit the translation.
-        prior: "mocap", a Gaussian of the embedded motion capture; one of your own (`pose_prior`);
-            or None.
-        limits: "anatomical", the ranges in `spt_jax.fit.terms.priors`; `joint_limits` of your own;
-            or None.
-        prior_weight, limits_weight, shape_weight, upright_weight: what each term counts for.
-        expected_error: of a keypoint, in pixels, one number or one for each person, (...); by None
-            a hundredth of the larger side of the box around a person's keypoints.
-        robust: Geman-McClure's scale in pixels (rho(x) = x^2 / (1 + (x / scale)^2)), one number or
-            one for each person, (...): keypoints much farther off are taken for mistakes. By None
-            rho(x) = x^2.
-        starts: how many orientations to try.
-        solver: of the regularised stages, any optimistix minimiser; BFGS by default.
-        keypoint_solver: minimises the keypoints' objective in the search; any optimistix minimiser.
-        max_steps: of each regularised stage.
+        start: where the fit starts, what is held fixed and whether the shape is fitted.
+        terms: prior, limits, their weights, and how far off keypoints are expected to be.
+        regularizer: "spt", the self-intersection penalty; "none"; "spheres" and "laplacian", the
+            rivals of the paper's section 4.4; or a `Regularizer` with weights of its own.
+        search: how many orientations are tried, and what minimizes the keypoints' objective.
+        stages: what minimizes it with the regularizer.
+        on_step: called with a `spt_jax.Step` after the search, stage 0, and after each stage of the
+            regularizer; what it raises ends the fit. Person after person of a batch.
 
     Returns:
         FitResult with the batch axes of `keypoints`. It is never NaN for usable input: where a
         stage fails, what was there before it stays.
 
     Raises:
-        TypeError, ValueError: arguments of the wrong kind or shape, named in the message; where
-            values are known: keypoints that are seen and not finite, confidence negative or not
-            finite, nobody's keypoints seen, parameters that are not finite.
+        TypeError, ValueError: arguments of the wrong kind or shape, named in the message; on_step
+            where values are traced; where they are known: keypoints that are seen and not finite,
+            confidence negative or not finite, nobody's keypoints seen, parameters that are not
+            finite.
 
     Differentiation: none is meant; it runs under jit and vmap.
 
@@ -119,7 +100,7 @@ def fit_pose(
         >>> camera = PinholeCamera(1000.0, (500.0, 500.0), translation=(0.0, 0.0, 4.0))
         >>> turned = jnp.zeros((52, 3)).at[0, 0].set(jnp.pi)  # upright: the image's y points down
         >>> seen = camera.project(body(turned).joints[:22])
-        >>> fit = fit_pose(body, seen, camera, layout=body.joint_names[:22], regulariser="none")
+        >>> fit = fit_pose(body, seen, camera, layout=body.joint_names[:22], regularizer="none")
         >>> bool(jnp.abs(fit.keypoints - seen).max() < 10)  # pixels, of a person of 460
         True
     """
@@ -129,81 +110,149 @@ def fit_pose(
         camera,
         layout=layout,
         confidence=confidence,
-        regulariser=regulariser,
-        pose=pose,
-        shape=shape,
-        translation=translation,
-        fit_shape=fit_shape,
-        fit_translation=fit_translation,
-        prior=prior,
-        limits=limits,
-        prior_weight=prior_weight,
-        limits_weight=limits_weight,
-        shape_weight=shape_weight,
-        upright_weight=upright_weight,
-        expected_error=expected_error,
-        robust=robust,
-        starts=starts,
-        solver=solver,
-        keypoint_solver=keypoint_solver,
-        max_steps=max_steps,
+        start=start,
+        terms=terms,
+        regularizer=regularizer,
+        search=search,
+        stages=stages,
     )
-    found = _fit_each(setup, people)
+    found = fit_each(setup, people, on_step)
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
 
 
-def _fit_each(setup: Setup, people: Person) -> FitResult:
+def fit_each(setup: Setup, people: Person, on_step: OnStep | None = None) -> FitResult:
+    """Fit the people of one leading axis."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((setup, people))):
+        if on_step is not None:
+            raise TypeError(
+                "on_step must be left out where values are traced: got one under jit, vmap or grad."
+            )
         return jax.vmap(lambda person: _fit_one(setup, person))(people)
     # Under vmap every lane waits for the slowest, through each of the search's loops: eight people
     # took 1.3 times as long as one by one. Nor in threads: two of these programs at a time make
     # XLA's CPU client wait for itself for ever (jax 0.10.2, two cores).
     count = len(people.keypoints)
     rows = [jax.tree.map(lambda leaf, k=k: leaf[k], people) for k in range(count)]
-    found = [_fit_one(setup, row) for row in rows]
+    if on_step is None:
+        found = [_fit_one(setup, row) for row in rows]
+    else:
+        found = [_fit_in_steps(setup, row, on_step) for row in rows]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
 
 def _fit_one(setup: Setup, person: Person) -> FitResult:
-    # Two programs: fits with different regularisers share the first, which takes longer to compile.
-    return _regularise(setup, person, _searched(setup.search, person))
+    # Two programs: fits with different regularizers share the first, which takes longer to compile.
+    return _regularize(setup, person, _searched(setup.search, person))
+
+
+def _fit_in_steps(setup: Setup, person: Person, on_step: OnStep) -> FitResult:
+    """`_fit_one` with a program a stage, so that each can be looked at."""
+    candidates = _searched(setup.search, person)
+    tracks = _tracks(setup, person, candidates)
+    taken = int(candidates.steps)
+    on_step(_step(setup, 0, taken, _posed(setup, person, tracks[0])))
+    ends = None
+    for number, weight in enumerate(setup.regularizer.weights):
+        now = dataclasses.replace(
+            setup, regularizer=dataclasses.replace(setup.regularizer, weights=weight[None])
+        )
+        ends, best = _one_stage(now, person, tracks)
+        tracks, taken = ends.vectors[:, 0], taken + int(jnp.sum(ends.steps))
+        on_step(_step(setup, number + 1, taken, _posed(setup, person, tracks[best])))
+    assert ends is not None  # a regularizer has a weight at least
+    return _chosen(setup, person, ends, jnp.asarray(taken))
 
 
 @program
-def _searched(search: Search, person: Person) -> Candidates:
+def _searched(search: KeypointSearch, person: Person) -> Candidates:
     return search.candidates(search.objective(person).forgiving(), _LOOKED_AT)
 
 
 @program
-def _regularise(setup: Setup, person: Person, candidates: Candidates) -> FitResult:
-    objective, regulariser = setup.search.objective(person), setup.regulariser
-    alone = jax.tree.map(lambda leaf: leaf[None], objective)
-    weights = regulariser.weights.astype(candidates.vectors.dtype)
+def _regularize(setup: Setup, person: Person, candidates: Candidates) -> FitResult:
+    tracks = _tracks_of(setup, person, candidates)
+    ends = _descended(setup, person, tracks)
+    return _chosen_of(setup, person, ends, candidates.steps + jnp.sum(ends.steps))
+
+
+def _tracks_of(setup: Setup, person: Person, candidates: Candidates) -> Float[Array, "2 D"]:
+    """Where the regularized stages start.
+
+    The best by the keypoints, and the best with the regularizer: what a graze costs to end is only
+    known when both have gone through the stages.
+    """
+    objective, regularizer = setup.search.objective(person), setup.regularizer
+    alone = _alone(objective)
+    weights = regularizer.weights.astype(candidates.vectors.dtype)
 
     def energy(vector):
         now = unpacked(alone, vector[None])
         start = jax.tree.map(lambda leaf: leaf[None], objective.start)
-        return regulariser.energy(setup.body, start, now)
+        return regularizer.energy(setup.body, start, now)
 
     looked = candidates.vectors
     # What was searched with a more forgiving loss costs something else with its own.
     costs = candidates.costs if objective.robust is None else jax.vmap(objective.cost)(looked)
-    energies = jax.vmap(energy)(looked)
-    # The best by the keypoints, and the best with the regulariser: what a graze costs to end is
-    # only known when both have gone through the stages.
-    judged = costs + weights[-1] * energies
-    tracks = jnp.stack([looked[_least(costs)], looked[_least(judged)]])
+    judged = costs + weights[-1] * jax.vmap(energy)(looked)
+    return jnp.stack([looked[_least(costs)], looked[_least(judged)]])
+
+
+def _descended(setup: Setup, person: Person, tracks: Float[Array, "2 D"]) -> Descent:
+    alone = _alone(setup.search.objective(person))
 
     def through_stages(vector):
-        return descend(regulariser, setup.body, alone, vector[None], setup.solver, setup.max_steps)
+        return descend(
+            setup.regularizer, setup.body, alone, vector[None], setup.solver, setup.max_steps
+        )
 
-    ends = jax.vmap(through_stages)(tracks)
-    best = _least(ends.cost + weights[-1] * ends.energy)
+    return jax.vmap(through_stages)(tracks)
+
+
+def _chosen_of(setup: Setup, person: Person, ends: Descent, steps: Int[Array, ""]) -> FitResult:
+    """The result of the track that ended with the lowest total."""
+    regularizer, objective = setup.regularizer, setup.search.objective(person)
+    weight = regularizer.weights.astype(ends.vectors.dtype)[-1]
+    best = _least(ends.cost + weight * ends.energy)
     end = jax.tree.map(lambda leaf: leaf[best], ends)
-    name = regulariser.name
-    cost = {} if name == "none" else {name: weights[-1] * end.energy}
-    steps = candidates.steps + jnp.sum(ends.steps)
+    cost = {} if regularizer.name == "none" else {regularizer.name: weight * end.energy}
     return fit_result(setup.body, objective, end.vectors[0], cost, end.converged, steps)
+
+
+_tracks, _chosen = program(_tracks_of), program(_chosen_of)
+
+
+@program
+def _one_stage(
+    setup: Setup, person: Person, tracks: Float[Array, "2 D"]
+) -> tuple[Descent, Int[Array, ""]]:
+    ends = _descended(setup, person, tracks)
+    weight = setup.regularizer.weights.astype(tracks.dtype)[-1]
+    return ends, _least(ends.cost + weight * ends.energy)
+
+
+@program
+def _posed(
+    setup: Setup, person: Person, vector: Float[Array, "D"]
+) -> tuple[Float[Array, "J 3"], Float[Array, "V 3"]]:
+    found = setup.search.objective(person).unpack(vector)
+    return found.pose, setup.body(found.pose, found.shape, found.translation).vertices
+
+
+def _step(setup: Setup, stage: int, taken: int, posed: tuple[Array, Array]) -> Step:
+    pose, vertices = (np.asarray(one) for one in posed)
+    return Step(stage, taken, vertices, pose, partial(_volume_and_pairs, setup.body, vertices))
+
+
+def _volume_and_pairs(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> tuple[float, int]:
+    try:
+        report = intersection_report(vertices, body.faces, rest_surface=body.rest_surface)
+    except Unmeasurable:
+        return float("nan"), -1
+    return report.volume, report.intersecting_pairs
+
+
+def _alone(objective: Objective) -> Objective:
+    return jax.tree.map(lambda leaf: leaf[None], objective)
 
 
 def _least(costs: Float[Array, "N"]) -> Int[Array, ""]:

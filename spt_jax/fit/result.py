@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax._result import Result, plain
 from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax.body import BodyModel
-from spt_jax.fit import photograph
-from spt_jax.fit.objective import Objective
+from spt_jax.fit.problem import photograph
+from spt_jax.fit.problem.objective import Objective
 
 _WORDS = {
     "successful": "converged",
@@ -28,7 +28,7 @@ class FitResult(Result):
         keypoints: where the body's keypoints are in the image, in pixels.
         steps: of the solvers, over all starts and stages.
         terms: what each term costs at the end: "reprojection", "prior", "limits", "shape",
-            "upright" and the regulariser's name, weighted, those that were used; their sum is
+            "upright" and the regularizer's name, weighted, those that were used; their sum is
             "total". `fit_pose` says what they are.
         status: how it ended, one of `spt_jax.RESULTS` for each person; `reason` says it in words.
     """
@@ -67,7 +67,7 @@ def fit_result(
     body: BodyModel,
     objective: Objective,
     vector: Float[Array, "D"],
-    regularised: dict[str, Float[Array, ""]],
+    regularized: dict[str, Float[Array, ""]],
     converged: Bool[Array, ""],
     steps: Int[Array, ""],
 ) -> FitResult:
@@ -77,7 +77,7 @@ def fit_result(
         body: the model.
         objective: whose variables they are.
         vector: where the fit ended.
-        regularised: what the regulariser costs, by its name; empty for none.
+        regularized: what the regularizer costs, by its name; empty for none.
         converged: whether the last stage ended at a minimum.
         steps: of the solvers.
     """
@@ -85,7 +85,7 @@ def fit_result(
     posed = body(found.pose, found.shape, found.translation)
     terms = objective.costs(vector)
     del terms["ridge"]
-    terms |= regularised
+    terms |= regularized
     terms["total"] = sum(terms.values(), jnp.zeros((), vector.dtype))
     finite = jnp.all(jnp.isfinite(posed.vertices)) & jnp.isfinite(terms["total"])
     outside = photograph.outside_photographs(objective, vector, posed.vertices)

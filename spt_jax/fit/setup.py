@@ -1,42 +1,40 @@
 """Check the arguments of a fit and build the problem that all people of the batch share."""
 
-from typing import Any
+from typing import Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
-from jax.core import Tracer
-from jaxtyping import Array
 
 from spt_jax._camera import PinholeCamera
 from spt_jax.body import BodyModel
-from spt_jax.fit.figure import Figure, Variables, make_figure
-from spt_jax.fit.inputs import Person, as_people, count_points
-from spt_jax.fit.objective import Objective, Weights, as_seen
+from spt_jax.fit.options import Numbers, Search, Stages, Start, Terms, scalar
+from spt_jax.fit.problem.figure import Figure, make_figure
+from spt_jax.fit.problem.inputs import Keypoints, Person, as_people, as_seen_points, count_points
+from spt_jax.fit.problem.learned_priors import pose_prior
+from spt_jax.fit.problem.limits import JointLimits, joint_limits
+from spt_jax.fit.problem.objective import Objective, Weights, as_seen
+from spt_jax.fit.problem.priors import FunctionPosePrior, PosePrior, PriorFunction
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.fit.problem.viewer import Viewer
+from spt_jax.fit.regularizers import as_regularizer
+from spt_jax.fit.regularizers._base import Regularizer
 from spt_jax.fit.search.candidates import Candidates, find_candidates, refine_start
 from spt_jax.fit.search.flips import Limb, limbs_of
 from spt_jax.fit.solver import default_solver
-from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits, joint_limits, pose_prior
-from spt_jax.fit.terms.regularisers import Regulariser, as_regulariser
-from spt_jax.fit.viewer import Viewer
-from spt_jax.keypoints import keypoint_regressor
-
-# Of the fit to the keypoints alone, for each start. With 60 all starts of eight frames were cut
-# off, and two of the frames ended in worse minima than those next to the truth.
-_KEYPOINT_STEPS = 120
+from spt_jax.keypoints import AnyLayout, keypoint_regressor
 
 
-class Search(eqx.Module):
+class KeypointSearch(eqx.Module):
     """What a fit to the keypoints alone has to know: camera, terms and solver."""
 
     figure: Figure
     camera: PinholeCamera
-    prior: GaussianPosePrior | None
+    prior: PosePrior | None
     limits: JointLimits | None
     weights: Weights
-    keypoint_solver: optx.AbstractMinimiser
+    solver: optx.AbstractMinimiser
+    max_steps: int = eqx.field(static=True)
     limbs: tuple[Limb, ...] = eqx.field(static=True)
     starts: int = eqx.field(static=True)
     fit_shape: bool = eqx.field(static=True)
@@ -59,7 +57,7 @@ class Search(eqx.Module):
             confidence=person.confidence,
             pixels=person.pixels,
             robust=person.robust,
-            prior=self.prior,
+            prior=self.prior and self.prior.around(start.pose),
             limits=self.limits,
             weights=Weights(*(weight.astype(dtype) for weight in self.weights)),
             start=start,
@@ -71,56 +69,98 @@ class Search(eqx.Module):
     def candidates(self, objective: Objective, count: int) -> Candidates:
         """Fits to the keypoints alone, the best first; one where a start was given."""
         if not self.starts:
-            return refine_start(objective, self.keypoint_solver, 2 * _KEYPOINT_STEPS)
+            return refine_start(objective, self.solver, 2 * self.max_steps)
         return find_candidates(
-            objective, self.limbs, self.starts, self.keypoint_solver, _KEYPOINT_STEPS, count
+            objective, self.limbs, self.starts, self.solver, self.max_steps, count
         )
 
 
 class Setup(eqx.Module):
     """What a whole fit has to know: the search, and the stages that come after it."""
 
-    search: Search
+    search: KeypointSearch
     body: BodyModel
-    regulariser: Regulariser
+    regularizer: Regularizer
     solver: optx.AbstractMinimiser
     max_steps: int = eqx.field(static=True)
 
 
 def prepare_fit(
     body: BodyModel,
-    keypoints: Any,
+    keypoints: Keypoints,
     camera: PinholeCamera,
     *,
-    layout: Any,
-    confidence: Any,
-    regulariser: Any,
-    pose: Any,
-    shape: Any,
-    translation: Any,
-    fit_shape: bool,
-    fit_translation: bool,
-    prior: Any,
-    limits: Any,
-    prior_weight: float,
-    limits_weight: float,
-    shape_weight: float,
-    upright_weight: float,
-    expected_error: Any,
-    robust: Any,
-    starts: int,
-    solver: Any,
-    keypoint_solver: Any,
-    max_steps: int,
+    layout: AnyLayout | None,
+    confidence: Numbers | None,
+    start: Start,
+    terms: Terms,
+    regularizer: str | Regularizer,
+    search: Search,
+    stages: Stages,
     in_scene: int = 1,
 ) -> tuple[Setup, Person, tuple[int, ...]]:
     """The setup of a call, its people in one leading axis, and the batch axes they came with.
 
     Args:
-        in_scene: how many people the regulariser sees together.
+        in_scene: how many people the regularizer sees together.
 
     The others, and the errors, are as `fit_pose` has them.
     """
+    _check_body_and_camera(body, camera)
+    for name, given, kind in (
+        ("start", start, Start),
+        ("terms", terms, Terms),
+        ("search", search, Search),
+        ("stages", stages, Stages),
+    ):
+        if not isinstance(given, kind):
+            raise TypeError(
+                f"{name} must be a spt_jax.fit.{kind.__name__}: got {type(given).__name__}."
+            )
+    points, trust, layout = as_seen_points(keypoints, confidence, layout)
+    likely, ranges = _as_prior(body, terms.prior), _as_limits(body, terms.limits)
+    for name, rows in (("prior", likely and likely.middle()), ("limits", ranges and ranges.low)):
+        if rows is not None and len(rows) != body.num_joints:
+            raise ValueError(
+                f"{name} must be of the body's {body.num_joints} joints: got one of {len(rows)}; "
+                "make it with body.joint_names."
+            )
+    # Of the body alone, and read on the host: under jit its constants would be tracers there.
+    with jax.ensure_compile_time_eval():
+        figure = make_figure(body, keypoint_regressor(body, layout, count=count_points(points)))
+    alone = KeypointSearch(
+        figure=figure,
+        camera=camera,
+        prior=likely and likely.of_joints(figure.moving),
+        limits=ranges and ranges.of_joints(figure.moving),
+        weights=Weights(
+            prior=scalar(terms.prior_weight),
+            limits=scalar(terms.limits_weight),
+            shape=scalar(terms.shape_weight),
+            upright=scalar(terms.upright_weight),
+        ),
+        solver=search.solver or default_solver(),
+        max_steps=int(search.max_steps),
+        limbs=limbs_of(figure.body),
+        starts=int(search.starts) if start.pose is None else 0,
+        fit_shape=bool(start.fit_shape),
+        fit_translation=bool(start.fit_translation),
+    )
+    setup = Setup(
+        search=alone,
+        body=body,
+        regularizer=as_regularizer(regularizer).prepared(body, in_scene),
+        solver=stages.solver or default_solver(),
+        max_steps=int(stages.max_steps),
+    )
+    # A search starts from the middle of what is likely: a T-pose is far from any that people take.
+    middle = (likely or pose_prior(body.joint_names)).middle()
+    first = (middle if start.pose is None else start.pose, start.shape, start.translation)
+    people, batch = as_people(body, points, trust, first, terms.expected_error, terms.robust)
+    return setup, people, batch
+
+
+def _check_body_and_camera(body: BodyModel, camera: PinholeCamera) -> None:
     if not isinstance(body, BodyModel):
         raise TypeError(f"body must be a BodyModel: got {type(body).__name__}; see load_body.")
     if not isinstance(camera, PinholeCamera):
@@ -133,83 +173,18 @@ def prepare_fit(
             f"camera must be one: got a batch of {camera.focal.shape[:-1]}; for a camera each use "
             "jax.vmap(lambda points, camera: fit_pose(body, points, camera, ...))."
         )
-    for name, number, least in (("starts", starts, 1), ("max_steps", max_steps, 1)):
-        if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
-            raise ValueError(f"{name} must be a whole number of at least {least}: got {number!r}.")
-    weights = {
-        "prior_weight": prior_weight,
-        "limits_weight": limits_weight,
-        "shape_weight": shape_weight,
-        "upright_weight": upright_weight,
-    }
-    weights = {name: _as_weight(name, weight) for name, weight in weights.items()}
-    for name, flag in (("fit_shape", fit_shape), ("fit_translation", fit_translation)):
-        if not isinstance(flag, (bool, np.bool_)):
-            raise TypeError(f"{name} must be True or False: got {flag!r}.")
-    likely, ranges = _as_prior(body, prior), _as_limits(body, limits)
-    for name, rows in (("prior", likely and likely.mean), ("limits", ranges and ranges.low)):
-        if rows is not None and len(rows) != body.num_joints:
-            raise ValueError(
-                f"{name} must be of the body's {body.num_joints} joints: got one of {len(rows)}; "
-                "make it with body.joint_names."
-            )
-    for name, given in (("solver", solver), ("keypoint_solver", keypoint_solver)):
-        if given is not None and not isinstance(given, optx.AbstractMinimiser):
-            raise TypeError(
-                f"{name} must be an optimistix minimiser, such as optimistix.BFGS(1e-3, 1e-3): got "
-                f"{type(given).__name__}."
-            )
-    # Of the body alone, and read on the host: under jit its constants would be tracers there.
-    with jax.ensure_compile_time_eval():
-        figure = make_figure(body, keypoint_regressor(body, layout, count=count_points(keypoints)))
-    search = Search(
-        figure=figure,
-        camera=camera,
-        prior=likely and likely.of_joints(figure.moving),
-        limits=ranges and ranges.of_joints(figure.moving),
-        weights=Weights(**{name.removesuffix("_weight"): w for name, w in weights.items()}),
-        keypoint_solver=keypoint_solver or default_solver(),
-        limbs=limbs_of(figure.body),
-        starts=int(starts) if pose is None else 0,
-        fit_shape=bool(fit_shape),
-        fit_translation=bool(fit_translation),
-    )
-    setup = Setup(
-        search=search,
-        body=body,
-        regulariser=as_regulariser(regulariser).prepared(body, in_scene),
-        solver=solver or default_solver(),
-        max_steps=int(max_steps),
-    )
-    # A search starts from the middle of what is likely: a T-pose is far from any that people take.
-    middle = (likely or pose_prior(body.joint_names)).mean
-    start = (middle if pose is None else pose, shape, translation)
-    people, batch = as_people(body, keypoints, confidence, start, expected_error, robust)
-    return setup, people, batch
 
 
-def _as_weight(name: str, weight: Any) -> Array:
-    # A JAX scalar may change without compiling anew, and may be traced.
-    number = isinstance(weight, (int, float, np.integer, np.floating))
-    known = number or (isinstance(weight, Array) and not isinstance(weight, Tracer))
-    if not isinstance(weight, Tracer) and not (
-        known and np.ndim(weight) == 0 and 0 <= float(weight) < np.inf
-    ):
-        raise ValueError(f"{name} must be a finite number, not negative: got {weight!r}.")
-    return jnp.asarray(weight, jnp.zeros(()).dtype)
-
-
-def _as_prior(body: BodyModel, prior: Any) -> GaussianPosePrior | None:
-    if isinstance(prior, str) and prior == "mocap":
-        return pose_prior(body.joint_names)
-    if prior is None or isinstance(prior, GaussianPosePrior):
+def _as_prior(
+    body: BodyModel, prior: Literal["mocap"] | PosePrior | PriorFunction | None
+) -> PosePrior | None:
+    if prior is None or isinstance(prior, PosePrior):
         return prior
-    raise ValueError(f'prior must be "mocap", a GaussianPosePrior or None: got {prior!r}.')
+    usual = pose_prior(body.joint_names)
+    return usual if isinstance(prior, str) else FunctionPosePrior(prior, usual.mean)
 
 
-def _as_limits(body: BodyModel, limits: Any) -> JointLimits | None:
-    if isinstance(limits, str) and limits == "anatomical":
-        return joint_limits(body.joint_names)
-    if limits is None or isinstance(limits, JointLimits):
-        return limits
-    raise ValueError(f'limits must be "anatomical", JointLimits or None: got {limits!r}.')
+def _as_limits(
+    body: BodyModel, limits: Literal["anatomical"] | JointLimits | None
+) -> JointLimits | None:
+    return joint_limits(body.joint_names) if isinstance(limits, str) else limits

@@ -10,7 +10,7 @@ class SettledBFGS(optx.AbstractBFGS):
     """optimistix's BFGS, which also ends when its next step is shorter than `atol`.
 
     optimistix looks at steps that were accepted. At a minimum that rounding has reached, as where
-    a regulariser is zero and the keypoints have been fitted already, each step is refused and
+    a regularizer is zero and the keypoints have been fitted already, each step is refused and
     halved until the steps run out: of 20 evaluations of the penalty 17 were spent that way.
 
     Attributes:

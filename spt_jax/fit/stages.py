@@ -1,4 +1,4 @@
-"""The keypoints' objective with a regulariser whose weight rises from stage to stage."""
+"""The keypoints' objective with a regularizer whose weight rises from stage to stage."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.body import BodyModel
-from spt_jax.fit.figure import Variables
-from spt_jax.fit.objective import Objective
-from spt_jax.fit.terms.regularisers import Regulariser
+from spt_jax.fit.problem.objective import Objective
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.fit.regularizers._base import Regularizer
 
 
 class Descent(NamedTuple):
@@ -18,26 +18,26 @@ class Descent(NamedTuple):
 
     vectors: Float[Array, "N D"]
     cost: Float[Array, ""]  # of the keypoints' objectives of all people
-    energy: Float[Array, ""]  # of the regulariser, without its weight
+    energy: Float[Array, ""]  # of the regularizer, without its weight
     steps: Int[Array, ""]
     converged: Bool[Array, ""]  # of the last stage
 
 
 def descend(
-    regulariser: Regulariser,
+    regularizer: Regularizer,
     body: BodyModel,
     people: Objective,
     vectors: Float[Array, "N D"],
     solver: optx.AbstractMinimiser,
     max_steps: int,
 ) -> Descent:
-    """Minimise the objectives of N people and a regulariser of all of them together.
+    """Minimise the objectives of N people and a regularizer of all of them together.
 
     Each stage minimises cost + weight * energy from where the last one ended, in coordinates in
     which the cost is round there (`Objective.unwhitening`).
 
     Args:
-        regulariser: prepared for the body and N people.
+        regularizer: prepared for the body and N people.
         body: the model.
         people: the objectives, stacked.
         vectors: where to start.
@@ -58,7 +58,7 @@ def descend(
             return total_cost(people, now) + weight * energy(now)
 
         def energy(now):
-            return regulariser.energy(body, start, unpacked(people, now))
+            return regularizer.energy(body, start, unpacked(people, now))
 
         solution = optx.minimise(
             total, solver, jnp.zeros_like(vectors), None, max_steps=max_steps, throw=False
@@ -69,13 +69,13 @@ def descend(
         carry = jnp.where(usable, ended, vectors), steps + solution.stats["num_steps"]
         return carry, (solution.result == optx.RESULTS.successful) & usable
 
-    weights = regulariser.weights.astype(vectors.dtype)
+    weights = regularizer.weights.astype(vectors.dtype)
     (vectors, steps), converged = jax.lax.scan(stage, (vectors, jnp.array(0)), weights)
     now = unpacked(people, vectors)
     return Descent(
         vectors,
         total_cost(people, vectors),
-        regulariser.energy(body, start, now),
+        regularizer.energy(body, start, now),
         steps,
         converged[-1],
     )

@@ -8,5 +8,6 @@ from spt_jax.keypoints.layouts import LAYOUTS as LAYOUTS
 from spt_jax.keypoints.layouts import Layout as Layout
 from spt_jax.keypoints.layouts import as_layout as as_layout
 from spt_jax.keypoints.layouts import edge_side as edge_side
+from spt_jax.keypoints.regressor import AnyLayout as AnyLayout
 from spt_jax.keypoints.regressor import KeypointRegressor as KeypointRegressor
 from spt_jax.keypoints.regressor import keypoint_regressor as keypoint_regressor

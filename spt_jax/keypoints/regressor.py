@@ -1,14 +1,16 @@
 """Keypoints of a body: a fixed linear map from its joints and a few of its vertices."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from scipy.sparse import sparray, spmatrix
 
 from spt_jax.body import BodyModel, PosedBody
 from spt_jax.keypoints.landmarks import LANDMARKS, find_landmarks
@@ -146,9 +148,15 @@ class KeypointRegressor(eqx.Module):
         return None if missing else tuple(self.names.index(name) for name in names)
 
 
+#: What keypoints are, in each of the ways of `keypoint_regressor`.
+AnyLayout: TypeAlias = (
+    str | Sequence[str] | Sequence[int] | ArrayLike | sparray | spmatrix | KeypointRegressor
+)
+
+
 def keypoint_regressor(
     body: BodyModel,
-    layout: Any,
+    layout: AnyLayout,
     *,
     count: int | None = None,
     names: str | Sequence[str] | None = None,
@@ -193,6 +201,7 @@ def keypoint_regressor(
         >>> regressor.names, len(regressor.vertices)
         (('left_wrist', 'nose'), 1)
     """
+    given: Any = layout
     if isinstance(layout, KeypointRegressor):
         made = layout
         if made.joint_weights.shape[-1] != body.num_joints or any(
@@ -207,9 +216,9 @@ def keypoint_regressor(
         known = as_layout(layout, count)
         made = _from_names(body, known.names, known.points, known.name, surface=known.surface)
     elif _is_sequence_of(layout, str):
-        made = _from_names(body, tuple(layout), tuple(layout), "layout", surface=False)
+        made = _from_names(body, tuple(given), tuple(given), "layout", surface=False)
     elif _is_sequence_of(layout, (int, np.integer)) or _is_row_of_indices(layout):
-        made = _from_indices(body, [int(index) for index in layout])
+        made = _from_indices(body, [int(index) for index in given])
     else:
         made = _from_dense(body, layout, names)
         names = None
@@ -310,7 +319,8 @@ def _from_dense(
         given = np.asarray(layout.toarray() if hasattr(layout, "toarray") else layout)
     except ValueError:  # rows of different lengths
         given = np.empty(0, object)
-    if not (np.issubdtype(given.dtype, np.floating) or np.issubdtype(given.dtype, np.integer)):
+    numbers = np.issubdtype(given.dtype, np.floating) or np.issubdtype(given.dtype, np.integer)
+    if not numbers or given.ndim == 0:
         raise TypeError(
             "layout must be a layout's name, a list of names or of joint indices, or an array of "
             f"weights: got {type(layout).__name__}."

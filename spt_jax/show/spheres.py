@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float, UInt8
 
 from spt_jax.body import BodyModel
-from spt_jax.fit.terms.spheres import BodySpheres, sphere_depths
+from spt_jax.fit.spheres.model import BodySpheres, sphere_depths
 from spt_jax.io.mesh_files import PENETRATING_COLOR
 from spt_jax.show.framing import View, frame
 from spt_jax.show.look import GAP, MATERIAL, Picture, check_png, check_size, finished
@@ -56,7 +56,7 @@ def render_spheres(
 
     Example:
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.terms.spheres import BodySpheres
+        >>> from spt_jax.fit.spheres.model import BodySpheres
         >>> from spt_jax.show.spheres import render_spheres
         >>> body = load_body()
         >>> render_spheres(body, BodySpheres.fit(body), size=(60, 80)).shape

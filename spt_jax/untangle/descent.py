@@ -12,13 +12,13 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax._penalty import self_intersection_penalty
 from spt_jax._status import RESULTS
+from spt_jax._steps import OnStep, Step
 from spt_jax.body import AbstractBody
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 from spt_jax.untangle.contact_solver import ContactSolver
-from spt_jax.untangle.steps import OnStep, Step
 
 Folds = Literal["ignore", "remove", "count"]
 

@@ -15,12 +15,12 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from spt_jax._steps import OnStep, Step
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.triangles.pairs import EdgeCrossings
 from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.spread import Spread, Surface
-from spt_jax.untangle.steps import OnStep, Step
 
 # How far a push spreads, in edges, by the root of the number of vertices in the overlap: wide
 # enough that the middle of a deep overlap and its rim move together. Of 0.17, 0.25 and 0.5, the

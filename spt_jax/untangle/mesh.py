@@ -10,12 +10,12 @@ from spt_jax._mesh_check import check_mesh, one_mesh
 from spt_jax._query import as_directions, as_rays
 from spt_jax._result import Overlap, Result
 from spt_jax._status import RESULTS, in_words, names_of
+from spt_jax._steps import OnStep, no_step
 from spt_jax.overlap.measure import Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.freeing import Freed, Place, free_vertices
 from spt_jax.untangle.spread import Surface
-from spt_jax.untangle.steps import OnStep, no_step
 
 
 class UntangleMeshResult(Result):

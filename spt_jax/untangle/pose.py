@@ -13,6 +13,7 @@ from spt_jax._exclusions import as_fold_surface
 from spt_jax._query import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax._result import Overlap, Result, plain
 from spt_jax._status import RESULTS, in_words, names_of
+from spt_jax._steps import OnStep
 from spt_jax.body import AbstractBody
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable
 from spt_jax.overlap.rays.beam import Rays
@@ -29,7 +30,6 @@ from spt_jax.untangle.descent import (
 )
 from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.spread import Surface
-from spt_jax.untangle.steps import OnStep
 
 # Per cubic centimetre, against squared centimetres of displacement. The first is weak enough that
 # the pose slides along the contact rather than jumping out of it; the last leaves about a

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from spt_jax._query import as_directions
+from spt_jax._steps import Step
 from spt_jax.overlap.measure import Sampling
 from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.pose import untangle_pose
 from spt_jax.untangle.spread import Surface
-from spt_jax.untangle.steps import Step
 from spt_jax.view.scene import Scene
 
 Show = Callable[[Float[np.ndarray, "V 3"], str], None]

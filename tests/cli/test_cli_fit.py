@@ -37,7 +37,7 @@ def calls(monkeypatch):
     made = []
 
     def stand_in(body, keypoints, camera, *, layout, confidence, **options):
-        made.append(dict(layout=layout, **options))
+        made.append(dict(layout=layout, robust=options["terms"].robust, **options))
         where = jnp.array([0.0, 0.0, 4.0])
         flip = jnp.array([1.0, -1.0, -1.0])
         return FitResult(
@@ -119,7 +119,7 @@ def test_a_coco_file_of_several_people_and_images(calls, tmp_path, capsys, rng):
     # Squares that bend at the same share of each person.
     sides = [np.ptp(rows[rows[:, 2] > 0, :2], axis=0).max() for _, rows in people]
     np.testing.assert_allclose([call["robust"] for call in calls], 0.1 * np.array(sides))
-    assert [call["regulariser"].name for call in calls] == ["spt"] * 3
+    assert [call["regularizer"].name for call in calls] == ["spt"] * 3
     poses = read_poses(out / "poses.npz")
     assert poses.names == names and poses.pose.shape == (3, 52, 3) and poses.shape is None
     np.testing.assert_allclose(poses.translation, [[0, 0, 4]] * 3)
@@ -171,7 +171,7 @@ def test_people_cameras_photographs_and_shape_are_as_asked_for(
         photographs / "000000000002.jpg",
         photographs / "000000000002.jpg",
     ]
-    assert calls[0]["robust"] == 12.5 and calls[0]["fit_shape"]
+    assert calls[0]["robust"] == 12.5 and calls[0]["start"].fit_shape
     for one in seen:
         np.testing.assert_allclose(one.errors, 3, rtol=1e-4)
         assert np.asarray(one.given.camera.focal).tolist() == [900, 900]
@@ -188,13 +188,13 @@ def test_the_report_as_json_and_no_robust_loss(calls, tmp_path, rng, monkeypatch
     people = [(1, person(rng)) for _ in range(3)]
     file = coco_file(tmp_path / "a.json", people, {1: (640, 480)})
     out = tmp_path / "out"
-    words = ["--json", "--robust", "off", "--regulariser", "none"]
+    words = ["--json", "--robust", "off", "--regularizer", "none"]
     assert main(["fit", file, "--out", str(out), *words]) == 0
     captured = capsys.readouterr()
     report = json.loads(captured.out)
     assert report == json.loads((out / "report.json").read_text())
     assert [call["robust"] for call in calls] == [None] * 3
-    assert calls[0]["regulariser"].name == report["settings"]["regulariser"] == "none"
+    assert calls[0]["regularizer"].name == report["settings"]["regularizer"] == "none"
     assert [one["name"] for one in report["people"]] == [f"000000000001/{k}" for k in range(3)]
     assert "Pictures were left out: no time" in captured.err
 
@@ -224,7 +224,7 @@ def test_people_of_an_image_together(calls, tmp_path, rng, monkeypatch, capsys):
     ((count, options),) = scenes
     assert count == 2
     sides = [np.ptp(rows[rows[:, 2] > 0, :2], axis=0).max() for k, rows in people if k == 1]
-    np.testing.assert_allclose(options["robust"], 0.1 * np.array(sides), rtol=1e-6)
+    np.testing.assert_allclose(options["terms"].robust, 0.1 * np.array(sides), rtol=1e-6)
     report = json.loads((out / "report.json").read_text())
     names = ["000000000001/0", "000000000001/2", "000000000002/1"]
     assert [one["name"] for one in report["people"]] == names
@@ -257,8 +257,7 @@ def test_what_is_a_fold_reaches_the_fit_and_the_report(
         return no_overlap(vertices)
 
     def together(body, keypoints, camera, **options):
-        scenes.append(options.pop("fold_distance"))
-        options = {name: value for name, value in options.items() if name != "robust"}
+        scenes.append(options.pop("scene").fold_distance)
         rows = [
             fitting.fit_pose(body, row, camera, **options | {"confidence": trust})
             for row, trust in zip(keypoints, options["confidence"], strict=True)
@@ -277,7 +276,7 @@ def test_what_is_a_fold_reaches_the_fit_and_the_report(
     usual = load_body().rest_surface
     wanted = usual.within(0.1) if words else usual
     assert scenes == [expected] and reports == [wanted] * 3
-    assert all(call["regulariser"].rest_surface == wanted for call in calls)
+    assert all(call["regularizer"].rest_surface == wanted for call in calls)
     settings = json.loads((out / "report.json").read_text())["settings"]
     assert settings["fold_distance"] == expected
 

@@ -9,13 +9,18 @@ from helpers import embedded_body
 from helpers_fit import camera, frames, seen
 
 from spt_jax import PinholeCamera, fit_pose
-from spt_jax.fit.inputs import as_people, count_points
-from spt_jax.fit.terms.priors import joint_limits, pose_prior
+from spt_jax.fit import Scene, Search, Stages, Start, Terms
+from spt_jax.fit.problem.inputs import as_people, count_points
+from spt_jax.fit.problem.learned_priors import pose_prior
+from spt_jax.fit.problem.limits import joint_limits
+from spt_jax.keypoints import Person
 
 POINTS = np.asarray(seen(frames("walk/0010"))[0])
 SPOILT = POINTS.copy()
 SPOILT[3, 1] = np.nan
 ONES = np.ones(22, np.float32)
+PERSON = Person(POINTS, ONES, "smpl22")
+OTHER = Person(POINTS[:17], ONES[:17], "coco17")
 SPINE = ("pelvis", "spine1", "spine2", "spine3")
 TWO_CAMERAS = jax.vmap(PinholeCamera, (0, None))(jnp.array([9e2, 1e3]), jnp.zeros(2))
 
@@ -31,12 +36,16 @@ def call(monkeypatch, untyped):
     def stop(*_):
         raise Unusable
 
-    monkeypatch.setattr("spt_jax.fit.pose._fit_each", stop)
+    monkeypatch.setattr("spt_jax.fit.pose.fit_each", stop)
 
     def called(**changed):
         given = {"body": embedded_body(), "keypoints": POINTS, "camera": camera()}
-        given |= {"layout": "smpl", "regulariser": "none"} | changed
+        given |= {"layout": "smpl", "regularizer": "none"} | changed
         body, keypoints, eye = (given.pop(name) for name in ("body", "keypoints", "camera"))
+        for kind, name in ((Start, "start"), (Terms, "terms"), (Search, "search")):
+            own = {key: given.pop(key) for key in kind.__annotations__ if key in given}
+            if own:
+                given[name] = kind(**own)
         return fit_pose(body, keypoints, eye, **given)
 
     return called
@@ -60,6 +69,10 @@ def call(monkeypatch, untyped):
         {"confidence": np.arange(22) > 3},
         {"keypoints": POINTS.astype(np.float16)},
         {"solver": optx.LBFGS(1e-3, 1e-3)},
+        {"stages": Stages(optx.LBFGS(1e-3, 1e-3))},
+        {"prior": lambda pose: pose},
+        {"keypoints": PERSON, "layout": None},
+        {"keypoints": [PERSON, PERSON], "layout": None},
     ],
 )
 def test_what_is_right_passes(good, call):
@@ -91,7 +104,16 @@ def test_what_is_right_passes(good, call):
         ({"keypoints": POINTS[:17]}, ValueError, "22.*17|17.*22|smpl"),
         ({"layout": "coco17"}, ValueError, "coco17 has 17 keypoints: got 22"),
         ({"layout": "mpii"}, ValueError, "mpii"),
-        ({"layout": None}, TypeError, "layout must be .*got NoneType"),
+        ({"layout": None}, ValueError, 'layout must say what the 22 .*got none; "smpl22" has so'),
+        ({"layout": 3}, TypeError, "layout must be .*got int"),
+        ({"keypoints": PERSON}, ValueError, "confidence and layout must be left out.*smpl22"),
+        (
+            {"keypoints": [PERSON, OTHER], "layout": None},
+            ValueError,
+            "people with one layout: got coco17, smpl22",
+        ),
+        ({"keypoints": [PERSON, POINTS], "layout": None}, TypeError, "all be of one kind"),
+        ({"start": np.zeros((52, 3))}, TypeError, "start must be a spt_jax.fit.Start: got ndarray"),
         ({"confidence": np.ones(5)}, ValueError, r"confidence must have shape \(..., 22\).*\(5,\)"),
         ({"confidence": np.ones((3, 22))}, ValueError, r"confidence must fit .*\(3, 22\)"),
         ({"confidence": -ONES}, ValueError, "confidence .*not negative: got -1"),
@@ -102,8 +124,8 @@ def test_what_is_right_passes(good, call):
             ValueError,
             r"confidence must be above 0.*person \[1\]",
         ),
-        ({"regulariser": "capsules"}, ValueError, "regulariser must be one of .*'spt'.*'capsules'"),
-        ({"regulariser": 3}, TypeError, "regulariser must be .*got 3"),
+        ({"regularizer": "capsules"}, ValueError, "regularizer must be one of .*'spt'.*'capsules'"),
+        ({"regularizer": 3}, TypeError, "regularizer must be .*got 3"),
         ({"pose": np.zeros((24, 3))}, ValueError, r"pose must have shape .*52, 3.*\(24, 3\)"),
         ({"pose": np.zeros((2, 52, 3))}, ValueError, r"pose must fit .*\(2, 52, 3\)"),
         ({"pose": np.full((52, 3), np.nan)}, ValueError, "pose must be finite"),
@@ -113,14 +135,10 @@ def test_what_is_right_passes(good, call):
         ({"pose": "run"}, TypeError, "pose must hold numbers: got str"),
         ({"prior": pose_prior(SPINE)}, ValueError, "prior must be of .* 52 joints: got one of 4"),
         ({"limits": joint_limits(SPINE)}, ValueError, "limits must be of .* 52 .* got one of 4"),
-        ({"solver": "bfgs"}, TypeError, "solver must be an optimistix minimiser.*got str"),
-        (
-            {"keypoint_solver": optx.LevenbergMarquardt(1e-3, 1e-3)},
-            TypeError,
-            "keypoint_solver must be .*minimiser.*LevenbergMarquardt",
-        ),
+        ({"solver": "bfgs"}, TypeError, "solver of the search must be an .* minimiser.*got str"),
         ({"camera": TWO_CAMERAS}, ValueError, r"camera must be one: got a batch of \(2,\).*vmap"),
         ({"prior": "vposer"}, ValueError, 'prior must be "mocap".*vposer'),
+        ({"prior": 3}, ValueError, 'prior must be "mocap".*got 3'),
         ({"limits": 2}, ValueError, 'limits must be "anatomical".*2'),
         ({"prior_weight": -1.0}, ValueError, "prior_weight .*not negative: got -1"),
         ({"limits_weight": np.nan}, ValueError, "limits_weight must be a finite .*nan"),
@@ -135,7 +153,7 @@ def test_what_is_right_passes(good, call):
         ({"starts": 0}, ValueError, "starts must be a whole number of at least 1: got 0"),
         ({"starts": 2.5}, ValueError, "starts .*2.5"),
         ({"starts": True}, ValueError, "starts .*True"),
-        ({"max_steps": 0}, ValueError, "max_steps must be .*got 0"),
+        ({"max_steps": 0}, ValueError, "max_steps of the search must be .*got 0"),
     ],
 )
 def test_what_is_wrong_is_said(wrong, kind, message, call):
@@ -197,3 +215,28 @@ def test_traced_keypoints_pass_where_values_cannot_be_known():
 
     found = jax.jit(pixels)(jnp.asarray(SPOILT), jnp.asarray(0 * ONES))
     np.testing.assert_array_equal(found, np.zeros((1, 22, 2)))
+
+
+@pytest.mark.parametrize("kind", [Stages, Scene])
+def test_what_is_wrong_with_a_solver_is_said(kind, untyped):
+    name = f"of the {kind.__name__.lower()}"
+    with pytest.raises(TypeError, match=f"solver {name} must be .*minimiser.*LevenbergMarquardt"):
+        kind(solver=optx.LevenbergMarquardt(1e-3, 1e-3))
+    with pytest.raises(ValueError, match=f"max_steps {name} must be .*got 0"):
+        kind(max_steps=0)
+
+
+def test_what_is_wrong_with_a_scene_is_said(untyped):
+    with pytest.raises(ValueError, match="weights must be finite"):
+        Scene(weights=[-1.0])
+    with pytest.raises(ValueError, match="margin must be finite and not negative"):
+        Scene(margin=-1.0)
+
+
+def test_nothing_is_told_of_steps_where_values_are_traced():
+    def traced(points):
+        options = {"layout": "smpl", "regularizer": "none", "on_step": print}
+        return fit_pose(embedded_body(), points, camera(), **options).pose
+
+    with pytest.raises(TypeError, match="on_step must be left out where values are traced"):
+        jax.eval_shape(traced, jnp.asarray(POINTS))

@@ -9,9 +9,9 @@ from helpers_fit import camera, frames, objective, seen
 
 from spt_jax import RESULTS, PinholeCamera
 from spt_jax._status import OUTSIDE, names_of
-from spt_jax.fit import photograph
-from spt_jax.fit.figure import Variables
-from spt_jax.fit.photograph import DISTANCE, FOCAL, SIZE, is_too_wide, outside_photographs
+from spt_jax.fit.problem import photograph
+from spt_jax.fit.problem.photograph import DISTANCE, FOCAL, SIZE, is_too_wide, outside_photographs
+from spt_jax.fit.problem.variables import Variables
 from spt_jax.fit.result import FitResult
 
 POSE = frames("walk/0010")[0]

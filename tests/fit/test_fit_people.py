@@ -1,6 +1,7 @@
 """Several people in one scene: none in another, by ipctk."""
 
 import ipctk
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -40,7 +41,9 @@ def fitted(body, embrace):
     joints = body(poses, translation=places).joints[:, :22]
     noise = np.random.default_rng(3).normal(scale=3.0, size=(2, 22, 2))
     seen = camera.project(joints) + jnp.asarray(noise, joints.dtype)
-    return fit_people(body, seen, camera, layout="smpl", regulariser="none"), seen
+    steps = []
+    found = fit_people(body, seen, camera, layout="smpl", regularizer="none", on_step=steps.append)
+    return found, seen, steps
 
 
 def intersecting_pairs_between(body, vertices):
@@ -62,7 +65,10 @@ def intersecting_pairs_between(body, vertices):
 
 @pytest.mark.slow
 def test_people_who_embrace_end_apart(body, fitted):
-    found, seen = fitted
+    found, seen, steps = fitted
+    assert [step.stage for step in steps] == list(range(len(steps)))
+    assert len(steps) >= 6 and len(steps[0].vertices) == 2 * body.num_vertices
+    assert steps[0].intersecting_pairs > 0
     assert int(found.before.intersecting_pairs_between) > 0
     assert int(found.after.intersecting_pairs_between) == 0
     assert intersecting_pairs_between(body, found.people.vertices) == 0
@@ -72,10 +78,17 @@ def test_people_who_embrace_end_apart(body, fitted):
     assert float(off.mean()) < 12.0  # pixels, of people 580 pixels tall, with noise of 3
 
 
-def test_options_that_fit_pose_lacks_are_refused(body):
+def test_what_is_no_scene_is_refused(body):
+    camera = PinholeCamera(1200.0, (500.0, 500.0))
+    points = np.zeros((22, 2), np.float32)
+    with pytest.raises(ValueError, match=r"keypoints must have shape \(N, K, 2\).*batch of \(\)"):
+        fit_people(body, points, camera, layout="smpl")
+    with pytest.raises(TypeError, match="keypoints must be known"):
+        jax.eval_shape(lambda x: fit_people(body, x, camera, layout="smpl"), points)
+
+
+def test_what_is_no_option_of_a_scene_is_refused(body, untyped):
     camera = PinholeCamera(1200.0, (500.0, 500.0))
     points = np.zeros((2, 22, 2), np.float32)
-    with pytest.raises(
-        TypeError, match=r"takes the options of fit_pose: got an unexpected 'weight'"
-    ):
-        fit_people(body, points, camera, layout="smpl", weight=1.0)
+    with pytest.raises(TypeError, match=r"scene must be a spt_jax\.fit\.Scene: got float"):
+        fit_people(body, points, camera, layout="smpl", scene=1.0)

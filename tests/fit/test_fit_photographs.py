@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera, fit_pose, load_body, load_mocap, read_keypoints
 from spt_jax._status import names_of
-from spt_jax.fit.terms.priors import joint_limits
+from spt_jax.fit import Terms
+from spt_jax.fit.problem.limits import joint_limits
 from spt_jax.keypoints import LAYOUTS, keypoint_regressor
 
 pytestmark = pytest.mark.slow
@@ -140,18 +141,16 @@ def fitted(body, people, **options):
     camera = PinholeCamera.from_field_of_view(float(WIDTH), float(HEIGHT))
     return fit_pose(
         body,
-        np.stack([person.points for person in people]).astype(np.float32),
+        people,
         camera,
-        layout="coco17",
-        confidence=np.stack([person.confidence for person in people]).astype(np.float32),
         **options,
     )
 
 
 @pytest.fixture(scope="module")
 def fits(body, people):
-    """All of them in one call, without a regulariser: compiled once."""
-    return fitted(body, people, regulariser="none")
+    """All of them in one call, without a regularizer: compiled once."""
+    return fitted(body, people, regularizer="none")
 
 
 def rows_of(*kinds):
@@ -243,7 +242,7 @@ def test_the_points_that_were_seen_are_explained(people, fits):
 
 def test_with_the_penalty_and_mistakes_left_out(body, people, fits):
     rows = [rows_of("half")[0], rows_of("upper")[0]]
-    found = fitted(body, [people[k] for k in rows], regulariser="spt", robust=15.0)
+    found = fitted(body, [people[k] for k in rows], regularizer="spt", terms=Terms(robust=15.0))
     for leaf in jax.tree.leaves(found):
         assert np.isfinite(leaf).all()
     assert (lean(body, np.asarray(found.joints)) < 40).all()

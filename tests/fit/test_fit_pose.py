@@ -17,9 +17,17 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax import RESULTS, PinholeCamera, fit_pose, intersection_report
 from spt_jax._status import names_of
-from spt_jax.fit.figure import Variables
+from spt_jax.fit import (
+    Regularizer,
+    SelfIntersection,
+    Stages,
+    Start,
+    Terms,
+    Variables,
+    as_regularizer,
+)
 from spt_jax.fit.stages import descend, total_cost
-from spt_jax.fit.terms.regularisers import Regulariser, SelfIntersection, as_regulariser
+from spt_jax.keypoints import Person
 
 NAMES = (
     "walk/0010",
@@ -31,7 +39,7 @@ NAMES = (
     "walk/0020",
     "spinkick/0030",
 )
-# As fitted without a regulariser these collide.
+# As fitted without a regularizer these collide.
 COLLIDING = ("punch/0017", "punch/0012")
 
 
@@ -43,9 +51,9 @@ def people():
 
 
 def fit(keypoints, by=None, **options):
-    """People in one call, without a regulariser: one compilation for all tests that use it."""
+    """People in one call, without a regularizer: one compilation for all tests that use it."""
     by = camera() if by is None else by
-    return fit_pose(embedded_body(), keypoints, by, layout="smpl", regulariser="none", **options)
+    return fit_pose(embedded_body(), keypoints, by, layout="smpl", regularizer="none", **options)
 
 
 @pytest.fixture(scope="module")
@@ -141,15 +149,13 @@ def test_other_values_do_not_compile_anew(people, plain, caplog):
             people[2][0] + 1,
             eye,
             confidence=np.full(22, 0.5, np.float32),
-            prior_weight=0.5,
-            upright_weight=0.1,
-            expected_error=6.0,
+            terms=Terms(prior_weight=0.5, upright_weight=0.1, expected_error=6.0),
         )
         jax.jit(lambda x: x + 1)(1.0)
     assert found.pose.shape == (52, 3)
     compiled = [record.getMessage() for record in caplog.records]
     assert any("jit(<lambda>)" in message for message in compiled)
-    programs = ("_searched", "_regularise")
+    programs = ("_searched", "_regularize")
     assert not [line for line in compiled if any(f"jit({name})" in line for name in programs)]
 
 
@@ -190,7 +196,8 @@ def overlap(found):
 def test_the_penalty_frees_bodies_that_collide():
     """The default, as users call it."""
     keypoints = np.asarray(seen(frames(*COLLIDING)))
-    found = fit_pose(embedded_body(), keypoints, camera(), layout="smpl")
+    people = [Person(points, np.ones(22, np.float32), "smpl22") for points in keypoints]
+    found = fit_pose(embedded_body(), people, camera())
     before, after = overlap(fit(keypoints)), overlap(found)
     assert min(before) > 1  # cm^3
     assert max(after) < 0.2
@@ -202,7 +209,7 @@ def test_the_penalty_frees_bodies_that_collide():
     assert np.linalg.norm(found.keypoints - keypoints, axis=-1).mean() < 4
 
 
-class Crouch(Regulariser):
+class Crouch(Regularizer):
     """A user's own: how high the head is above the pelvis, squared, in decimetres."""
 
     name: ClassVar[str] = "crouch"
@@ -215,7 +222,7 @@ class Crouch(Regulariser):
 
 
 @pytest.mark.slow
-def test_ones_own_start_and_regulariser_in_double_precision(x64):
+def test_ones_own_start_and_regularizer_in_double_precision(x64):
     """From a given pose, with shape, one keypoint wrong, the body's place known."""
     body = embedded_body()
     pose = frames("walk/0010")[0].astype(jnp.float64)
@@ -231,14 +238,10 @@ def test_ones_own_start_and_regulariser_in_double_precision(x64):
             keypoints,
             camera(np.float64),
             layout="smpl",
-            regulariser=Crouch(jnp.asarray([weight])),
-            pose=near.at[30].set(0.3),
-            translation=shift,
-            fit_shape=True,
-            fit_translation=False,
-            shape_weight=0.01,
-            robust=robust,
-            solver=optx.BFGS(1e-4, 1e-4),
+            regularizer=Crouch(jnp.asarray([weight])),
+            start=Start(near.at[30].set(0.3), None, shift, fit_shape=True, fit_translation=False),
+            terms=Terms(shape_weight=0.01, robust=robust),
+            stages=Stages(optx.BFGS(1e-4, 1e-4)),
         )
 
     loyal = at(0.0, 20.0)
@@ -272,12 +275,12 @@ def test_ones_own_start_and_regulariser_in_double_precision(x64):
         ("paper", optx.GradientDescent(1e-3, 1e-3, 1e-3)),
     ],
 )
-def test_each_regulariser_descends_with_another_solver(name, solver):
+def test_each_regularizer_descends_with_another_solver(name, solver):
     """The stages alone; "paper" has a gradient that is not its value's, so no line search."""
     body = embedded_body()
     pose = frames("punch/0007")[0]
     paper = SelfIntersection(1.0, folds="count", value="ratio", gradient="unit")
-    term = (paper if name == "paper" else as_regulariser(name)).prepared(body, 1)
+    term = (paper if name == "paper" else as_regularizer(name)).prepared(body, 1)
     start = Variables(pose, np.zeros(10), np.zeros(3))
     case = objective(seen(pose), start=start)
     case = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], case)
@@ -307,12 +310,40 @@ def test_too_few_steps_are_said():
         np.asarray(seen(frames("walk/0010", "run/0010")))[:, :9],
         camera(),
         layout=list(range(9)),
-        regulariser="none",
-        pose=np.zeros((52, 3)),
-        prior=None,
-        limits=None,
-        max_steps=1,
+        regularizer="none",
+        start=Start(np.zeros((52, 3))),
+        terms=Terms(prior=None, limits=None),
+        stages=Stages(max_steps=1),
     )
     assert names_of(found.status) == ["nonlinear_max_steps_reached"] * 2
     assert found.reason == ["stopped at the largest number of steps"] * 2
     assert set(found.terms) == {"reprojection", "upright", "total"}
+
+
+@pytest.mark.slow
+def test_each_stage_is_told_and_the_result_is_the_same():
+    body = embedded_body()
+    points = np.asarray(seen(frames(COLLIDING[0])))[0]
+    steps = []
+    usual, told = (
+        fit_pose(body, points, camera(), layout="smpl", on_step=on_step)
+        for on_step in (None, steps.append)
+    )
+    assert [step.stage for step in steps] == [0, 1, 2, 3]
+    taken = [step.steps for step in steps]
+    assert taken == sorted(taken) and taken[-1] == int(told.steps)
+    assert steps[0].volume > 1e-6 and steps[0].intersecting_pairs > 0
+    assert steps[-1].volume < 0.1 * steps[0].volume
+    np.testing.assert_allclose(steps[-1].vertices, told.vertices, atol=1e-6)
+    np.testing.assert_array_equal(steps[-1].pose, told.pose)
+    assert 1e3 * np.linalg.norm(told.vertices - usual.vertices, axis=-1).mean() < 1
+
+
+def test_what_a_callback_raises_ends_the_fit(people, plain):
+    del plain  # compiled by now
+
+    def stop(step):
+        raise KeyboardInterrupt(step.stage)
+
+    with pytest.raises(KeyboardInterrupt, match="0"):
+        fit(people[2][0], on_step=stop)

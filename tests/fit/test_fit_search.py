@@ -13,7 +13,7 @@ from helpers_fit import UPRIGHT, camera, figure, frames, objective, seen
 from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera
-from spt_jax.fit.figure import Variables
+from spt_jax.fit.problem.variables import Variables
 from spt_jax.fit.search.candidates import find_candidates, refine_start
 from spt_jax.fit.search.flips import combined_flips, limb_flips, limbs_of
 from spt_jax.fit.search.starts import orientation_starts

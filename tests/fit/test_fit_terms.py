@@ -13,17 +13,20 @@ from scipy.spatial.transform import Rotation
 from spt_jax import keypoint_regressor, self_intersection_penalty
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.body.rotations import matrix_from_axis_angle
-from spt_jax.fit.figure import Variables, make_figure
-from spt_jax.fit.terms.priors import GaussianPosePrior, joint_limits, pose_prior
-from spt_jax.fit.terms.regularisers import (
+from spt_jax.fit import (
     Laplacian,
     Nothing,
-    Regulariser,
+    Regularizer,
     SelfIntersection,
     Spheres,
-    as_regulariser,
+    as_regularizer,
     as_weights,
 )
+from spt_jax.fit.problem.figure import make_figure
+from spt_jax.fit.problem.learned_priors import pose_prior
+from spt_jax.fit.problem.limits import joint_limits
+from spt_jax.fit.problem.priors import GaussianPosePrior
+from spt_jax.fit.problem.variables import Variables
 
 NAMES = SMPL_LAYOUTS[22]
 
@@ -331,7 +334,7 @@ def test_people_stay_within_the_limits():
         (lambda: SelfIntersection(folds="maybe"), "folds"),
         (lambda: SelfIntersection(value="area"), "value"),
         (lambda: SelfIntersection(margin=-1.0), "margin"),
-        (lambda: as_regulariser("capsules"), "'none', 'spt', 'spheres', 'laplacian'"),
+        (lambda: as_regularizer("capsules"), "'laplacian', 'none', 'spheres', 'spt'"),
         (lambda: Spheres().prepared(embedded_body(), 2), "one body's own parts"),
     ],
 )
@@ -340,7 +343,7 @@ def test_what_is_wrong_is_said(make, message, untyped):
         make()
 
 
-# Regularisers.
+# Regularizers.
 
 
 def people(*names):
@@ -400,24 +403,24 @@ def test_the_laplacian_term_is_mean_squared_change_in_square_millimetres():
     np.testing.assert_allclose(term.energy(body, start, moved), 0, atol=1e-9)
 
 
-def test_named_regularisers_and_their_own_weights():
+def test_named_regularizers_and_their_own_weights():
     for name, kind in (
         ("none", Nothing),
         ("spt", SelfIntersection),
         ("spheres", Spheres),
         ("laplacian", Laplacian),
     ):
-        made = as_regulariser(name)
+        made = as_regularizer(name)
         assert type(made) is kind and made.name == name
     own = SelfIntersection(0.5)
-    assert as_regulariser(own) is own
+    assert as_regularizer(own) is own
     np.testing.assert_array_equal(own.weights, [0.5])
-    assert isinstance(own, Regulariser)
-    with pytest.raises(TypeError, match="Regulariser: got 3"):
-        as_regulariser(3)
+    assert isinstance(own, Regularizer)
+    with pytest.raises(TypeError, match="Regularizer: got 3"):
+        as_regularizer(3)
 
 
-def test_regularisers_are_prepared_inside_jit():
+def test_regularizers_are_prepared_inside_jit():
     """Their weights are tracers there."""
     body = embedded_body()
     now = people("punch/0007")

@@ -9,8 +9,8 @@ from helpers_fit import frames
 from scipy.spatial.transform import Rotation
 
 from spt_jax import PinholeCamera
-from spt_jax.fit.figure import Variables
-from spt_jax.fit.viewer import Viewer, composed
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.fit.problem.viewer import Viewer, composed
 
 ROTATION = Rotation.from_euler("xyz", (160, 35, -20), degrees=True).as_matrix()
 

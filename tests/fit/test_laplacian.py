@@ -1,4 +1,4 @@
-"""Laplacian regularisation: against its definition, and its laws."""
+"""Laplacian regularization: against its definition, and its laws."""
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import pytest
 from helpers import box, random_rotation
 from helpers import sphere as solid_sphere
 
-from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
+from spt_jax.fit.regularizers.laplacian import MeshLaplacian, laplacian_penalty
 
 VERTICES, FACES = solid_sphere(subdivisions=1)
 COUNT = len(VERTICES)

@@ -75,6 +75,23 @@ def test_no_modules_import_each_other_in_a_circle():
     list(graphlib.TopologicalSorter(GRAPH).static_order())  # raises CycleError
 
 
+def folder(name):
+    path = FILES[name]
+    return path.parent if path.name != "__init__.py" else None  # those list what is public
+
+
+def test_no_folders_import_each_other_in_a_circle():
+    """A folder's modules and the folder above it are two."""
+    folders = {}
+    for name, others in GRAPH.items():
+        found = {folder(other) for other in others} - {folder(name), None}
+        folders.setdefault(folder(name), set()).update(found)
+    # Top-level modules of the package stand on several floors: the penalty above `bridge`, and
+    # what all share below it.
+    folders = {at: found - {PACKAGE} for at, found in folders.items() if at not in (None, PACKAGE)}
+    list(graphlib.TopologicalSorter(folders).static_order())  # raises CycleError
+
+
 def test_the_measure_of_one_mesh_knows_nothing_of_the_rest():
     for name, others in GRAPH.items():
         if floor(name) == "overlap":

@@ -63,13 +63,11 @@ PARAMETERS = {
     "intersection_report": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), rest_surface=None",
     "check_mesh": "vertices, faces",
-    "fit_pose": "body, keypoints, camera, *, layout, confidence=None, regulariser='spt', pose=None,"
-    " shape=None, translation=None, fit_shape=False, fit_translation=True, prior='mocap',"
-    " limits='anatomical', prior_weight=1.0, limits_weight=1.0, shape_weight=1.0,"
-    " upright_weight=0.25, expected_error=None, robust=None, starts=6, solver=None,"
-    " keypoint_solver=None, max_steps=20",
-    "fit_people": "body, keypoints, camera, *, layout, weights=(0.01, 0.1, 1.0, 10.0, 100.0),"
-    " margin=0.002, fold_distance=None, max_steps=25, **options",
+    "fit_pose": "body, keypoints, camera, *, layout=None, confidence=None, start=Start(),"
+    " terms=Terms(), regularizer='spt', search=Search(), stages=Stages(), on_step=None",
+    "fit_people": "body, keypoints, camera, *, layout=None, confidence=None, start=Start(),"
+    " terms=Terms(), regularizer='spt', search=Search(), stages=Stages(),"
+    " scene=Scene(weights=(0.01, 0.1, 1.0, 10.0, 100.0)), on_step=None",
     "keypoint_regressor": "body, layout, *, count=None, names=None",
     "read_keypoints": "path, *, layout=None, max_bytes=None",
     "load_body": "source='anny', *, num_shape=10, num_expression=10, dtype=None, max_bytes=None",
@@ -132,20 +130,32 @@ NAMESPACES = {
     "fit": [
         "BodySpheres",
         "FitResult",
+        "FunctionPosePrior",
         "GaussianPosePrior",
         "JointLimits",
         "Laplacian",
+        "MixturePosePrior",
+        "Nothing",
         "Penetration",
         "PeopleResult",
-        "Regulariser",
+        "PosePrior",
+        "Regularizer",
+        "Scene",
+        "Search",
         "SelfIntersection",
         "Spheres",
+        "Stages",
+        "Start",
+        "Terms",
         "Variables",
+        "as_regularizer",
         "as_weights",
         "fit_people",
         "fit_pose",
         "joint_limits",
+        "mixture_prior",
         "pose_prior",
+        "regularizer_names",
     ],
     "io": [
         "Clip",

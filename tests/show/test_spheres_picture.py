@@ -7,7 +7,7 @@ from helpers import embedded_body
 from PIL import Image
 from test_pictures import needs_drawing, red
 
-from spt_jax.fit.terms.spheres import BodySpheres
+from spt_jax.fit.spheres.model import BodySpheres
 from spt_jax.show.spheres import render_spheres
 
 SIZE = (160, 160)

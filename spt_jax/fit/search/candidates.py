@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from spt_jax.fit.objective import Objective
+from spt_jax.fit.problem.objective import Objective
 from spt_jax.fit.search.flips import Limb, combined_flips, limb_flips, num_flips
 from spt_jax.fit.search.starts import orientation_starts
 

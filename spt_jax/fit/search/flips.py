@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from spt_jax.body import BodyModel
 from spt_jax.body.rotations import axis_angle_from_matrix
-from spt_jax.fit.objective import Objective
+from spt_jax.fit.problem.objective import Objective
 
 _LIMBS = (
     ("left_hip", "left_knee", "left_ankle"),

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from spt_jax.body.rotations import axis_angle_from_matrix
-from spt_jax.fit.figure import Variables
-from spt_jax.fit.objective import Objective
+from spt_jax.fit.problem.objective import Objective
+from spt_jax.fit.problem.variables import Variables
 
 # Directions from which the body is looked at, evenly over the sphere (24 degrees apart); what is
 # between them is left to the solver.

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from spt_jax.body import BodyModel
 from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.body.skinning import blend_shapes, forward_kinematics, lift
-from spt_jax.fit.terms.sphere_fitting import Rest, fit_spheres
-from spt_jax.fit.terms.surface_samples import sample_surface
+from spt_jax.fit.spheres.fitting import Rest, fit_spheres
+from spt_jax.fit.spheres.surface_samples import sample_surface
 
 # Distances at rest round differently from those in a pose; a pair that the shape alone brings
 # together may come this part nearer for nothing.
@@ -58,7 +58,7 @@ class BodySpheres(eqx.Module):
 
     Example:
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.terms.spheres import BodySpheres
+        >>> from spt_jax.fit.spheres.model import BodySpheres
         >>> spheres = BodySpheres.fit(load_body())
         >>> len(spheres.part)
         114
@@ -163,7 +163,7 @@ class BodySpheres(eqx.Module):
         Example:
             >>> import jax.numpy as jnp
             >>> from spt_jax import load_body
-            >>> from spt_jax.fit.terms.spheres import BodySpheres
+            >>> from spt_jax.fit.spheres.model import BodySpheres
             >>> body = load_body()
             >>> BodySpheres.fit(body).posed(body, jnp.zeros((8, 52, 3))).centers.shape
             (8, 114, 3)
@@ -189,7 +189,7 @@ class BodySpheres(eqx.Module):
 
         Example:
             >>> from spt_jax import load_body
-            >>> from spt_jax.fit.terms.spheres import BodySpheres
+            >>> from spt_jax.fit.spheres.model import BodySpheres
             >>> body = load_body()
             >>> covered, outside = BodySpheres.fit(body).coverage(body)
             >>> bool(covered > 0.88 and outside < 0.07)
@@ -245,7 +245,7 @@ def sphere_penalty(
     Example:
         >>> import jax.numpy as jnp
         >>> from spt_jax import load_body, load_mocap
-        >>> from spt_jax.fit.terms.spheres import BodySpheres, sphere_penalty
+        >>> from spt_jax.fit.spheres.model import BodySpheres, sphere_penalty
         >>> body, mocap = load_body(), load_mocap()
         >>> spheres = BodySpheres.fit(body)
         >>> punch = body.pose_from_smpl(mocap.pose[mocap.names.index("punch/0007")])

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from spt_jax._camera import PinholeCamera
 from spt_jax._status import RESULTS
-from spt_jax.fit.objective import Objective
+from spt_jax.fit.problem.objective import Objective
 
 # In metres, of what was seen of a person: from a hand before the lens to a figure at which COCO's
 # annotators stop marking keypoints, about 30 pixels tall, under the longest of lenses.

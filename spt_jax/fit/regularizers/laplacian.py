@@ -1,4 +1,7 @@
-"""Laplacian regularisation, the paper's rival "RE + LR": vertices move as their neighbours do."""
+"""Laplacian regularization, the paper's rival "RE + LR": vertices move as their neighbours do."""
+
+import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -8,6 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Integer
 
 from spt_jax._query import as_mesh
+from spt_jax.body import BodyModel
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.fit.regularizers._base import Regularizer, as_weights
 from spt_jax.overlap.topology import Edges
 
 
@@ -23,7 +29,7 @@ class MeshLaplacian(eqx.Module):
 
     Example:
         >>> from spt_jax import load_body
-        >>> from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
+        >>> from spt_jax.fit.regularizers.laplacian import MeshLaplacian, laplacian_penalty
         >>> body = load_body()
         >>> laplacian = MeshLaplacian.from_faces(body.faces, body.num_vertices)
         >>> rest = body.rest()
@@ -118,7 +124,7 @@ def laplacian_penalty(
 
     Example:
         >>> import jax.numpy as jnp, numpy as np
-        >>> from spt_jax.fit.terms.laplacian import MeshLaplacian, laplacian_penalty
+        >>> from spt_jax.fit.regularizers.laplacian import MeshLaplacian, laplacian_penalty
         >>> square = jnp.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         >>> two = MeshLaplacian.from_faces(np.array([[0, 1, 2], [0, 2, 3]]), 4)
         >>> lifted = square.at[1, 2].set(3.0)  # deltas change by 3, -1, -1 and 0
@@ -133,3 +139,48 @@ def laplacian_penalty(
     vertices = vertices.reshape((1,) * (rank - vertices.ndim) + vertices.shape)
     moved = laplacian.coordinates(vertices - reference)
     return jnp.mean(jnp.sum(moved**2, axis=-1), axis=-1)
+
+
+class Laplacian(Regularizer):
+    """Laplacian regularization ("RE + LR", Wang et al. 2018), in mm^2.
+
+    What bends the surface costs, wherever it lies: the mean squared change of the Laplacian
+    coordinates since the first stage began, in the body's own frame.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from spt_jax import load_body
+        >>> from spt_jax.fit import Variables
+        >>> from spt_jax.fit import Laplacian
+        >>> body = load_body()
+        >>> shape, translation = jnp.zeros((1, body.num_shape)), jnp.zeros((1, 3))
+        >>> rest = Variables(jnp.zeros((1, body.num_joints, 3)), shape, translation)
+        >>> turned = rest._replace(pose=rest.pose.at[0, 0, 1].set(1.0))
+        >>> bent = rest._replace(pose=rest.pose.at[0, 4, 0].set(1.0))
+        >>> term = Laplacian().prepared(body, 1)
+        >>> [bool(term.energy(body, rest, now) > 0) for now in (turned, bent)]
+        [False, True]
+    """
+
+    name: ClassVar[str] = "laplacian"
+    weights: Float[Array, "stages"] = eqx.field(converter=as_weights, default=(1.0,))
+    laplacian: MeshLaplacian | None = None
+
+    def prepared(self, body: BodyModel, people: int) -> "Laplacian":
+        """With the neighbours of the body's vertices."""
+        if self.laplacian is not None:
+            return self
+        found = MeshLaplacian.from_faces(np.asarray(body.faces), body.num_vertices)
+        return dataclasses.replace(self, laplacian=found)
+
+    def energy(self, body: BodyModel, start: Variables, now: Variables) -> Float[Array, ""]:
+        """Mean squared change of the Laplacian coordinates, in mm^2, summed over the people."""
+        if self.laplacian is None:
+            raise ValueError("laplacian must be known: call prepared(body, people) first.")
+
+        def own_frame(variables: Variables) -> Array:
+            pose = variables.pose.at[..., 0, :].set(0.0)
+            return body(pose, variables.shape).vertices
+
+        reference = jax.lax.stop_gradient(own_frame(start))
+        return jnp.sum(laplacian_penalty(self.laplacian, reference, own_frame(now))) * 1e6

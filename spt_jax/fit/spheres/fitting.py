@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.fit.terms.surface_samples import Surface, sample_surface
+from spt_jax.fit.spheres.surface_samples import Surface, sample_surface
 
 # Grid cells in a part's bounding box, and candidate centres. With 600 cells the embedded body's
 # spheres lay 7.3 mm from the skin on average, not 6.1; with 100 centres 6.6 mm.

@@ -1,4 +1,4 @@
-"""What a fit minimises before any regulariser: keypoints, prior, limits, as a sum of squares."""
+"""What a fit minimises before any regularizer: keypoints, prior, limits, as a sum of squares."""
 
 import dataclasses
 from typing import NamedTuple
@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from spt_jax.fit.figure import Figure, Variables
-from spt_jax.fit.terms.priors import GaussianPosePrior, JointLimits
-from spt_jax.fit.viewer import Viewer
+from spt_jax.fit.problem.figure import Figure
+from spt_jax.fit.problem.limits import JointLimits
+from spt_jax.fit.problem.priors import PosePrior
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.fit.problem.viewer import Viewer
 
 # Per squared radian (and squared unit of shape) away from the start. It decides where nothing else
 # does, as for the twist of a limb without a prior; a radian costs as much as one keypoint that is
@@ -59,7 +61,7 @@ class Objective(eqx.Module):
     confidence: Float[Array, "K"]
     pixels: Float[Array, ""]  # s, the expected error
     robust: Float[Array, ""] | None  # g, in units of s
-    prior: GaussianPosePrior | None  # of the joints that move
+    prior: PosePrior | None  # of the joints that move
     limits: JointLimits | None  # likewise
     weights: Weights
     start: Variables  # of the whole body, in the world
@@ -155,7 +157,7 @@ class Objective(eqx.Module):
         """B such that in coordinates u, x = vector + B u, the cost is round near a point.
 
         B = L^-T with L L^T the Gauss-Newton matrix. A first-order solver in those coordinates goes
-        straight to the keypoints' optimum, and what a regulariser adds is weighed against a plain
+        straight to the keypoints' optimum, and what a regularizer adds is weighed against a plain
         sum of squares.
         """
         jacobian = jax.jacfwd(lambda x: jnp.concatenate(_flat(self.residuals(x))))(vector)

@@ -1,16 +1,23 @@
 """The keypoints and starts of people, checked and brought to one form."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from spt_jax.body import BodyModel
-from spt_jax.fit.figure import Variables
+from spt_jax.fit.problem.variables import Variables
+from spt_jax.keypoints import LAYOUTS, AnyLayout
+from spt_jax.keypoints import Person as SeenPerson
+
+#: Keypoints as users have them: pixels, or people with a layout and confidences of their own.
+Keypoints: TypeAlias = ArrayLike | Sequence[Any] | SeenPerson | Sequence[SeenPerson]
 
 # A keypoint is expected to be found within this share of the box around a person's keypoints: 5
 # pixels of a person who is 500 pixels tall.
@@ -25,6 +32,43 @@ class Person(eqx.Module):
     pixels: Float[Array, "*people"]  # expected error of a keypoint
     robust: Float[Array, "*people"] | None  # Geman-McClure's scale, in units of the expected error
     start: Variables
+
+
+def as_seen_points(
+    keypoints: Keypoints, confidence: Any, layout: AnyLayout | None
+) -> tuple[Any, Any, AnyLayout]:
+    """Points, confidences and layout of a call, apart.
+
+    Raises:
+        ValueError: people with confidences or layouts of their own who come with others, or whose
+            layouts differ; pixels without a layout.
+    """
+    people = [keypoints] if isinstance(keypoints, SeenPerson) else keypoints
+    if not (isinstance(people, (list, tuple)) and people and isinstance(people[0], SeenPerson)):
+        if layout is None:
+            count = count_points(keypoints)
+            known = [f'"{name}"' for name, one in LAYOUTS.items() if len(one.names) == count]
+            raise ValueError(
+                f"layout must say what the {count} keypoints are: got none; "
+                + (f"{' or '.join(known)} has so many." if known else "give a list of names.")
+            )
+        return keypoints, confidence, layout
+    if any(not isinstance(one, SeenPerson) for one in people):
+        raise TypeError("keypoints must all be of one kind: got people and others in one list.")
+    layouts = sorted({one.layout for one in people})
+    if len(layouts) > 1:
+        raise ValueError(
+            f"keypoints must be of people with one layout: got {', '.join(layouts)}; fit the "
+            "people of each layout in a call of their own."
+        )
+    if confidence is not None or layout not in (None, layouts[0]):
+        raise ValueError(
+            "confidence and layout must be left out where keypoints are people of read_keypoints: "
+            f"they have their own, of layout {layouts[0]}."
+        )
+    if isinstance(keypoints, SeenPerson):
+        return keypoints.points, keypoints.confidence, layouts[0]
+    return [one.points for one in people], [one.confidence for one in people], layouts[0]
 
 
 def as_people(

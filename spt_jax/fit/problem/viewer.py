@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from spt_jax._camera import PinholeCamera
 from spt_jax.body import BodyModel
 from spt_jax.body.rotations import axis_angle_from_matrix
-from spt_jax.fit.figure import Variables
+from spt_jax.fit.problem.variables import Variables
 
 # From the camera's axes (y down, z forward) to the viewer's.
 _UPRIGHT = np.diag([1.0, -1.0, -1.0])

@@ -16,18 +16,11 @@ from spt_jax.body.skinning import (
     forward_kinematics,
     linear_blend_skinning,
 )
+from spt_jax.fit.problem.variables import Variables
 from spt_jax.keypoints import KeypointRegressor
 
 # A joint that moves a landmark with less than a hundredth of its weight is not told by it.
 _LEAST_WEIGHT = 0.01
-
-
-class Variables(NamedTuple):
-    """A body's parameters: axis-angle in radians, shape coefficients, metres."""
-
-    pose: Float[Array, "*batch J 3"]
-    shape: Float[Array, "*batch B"]
-    translation: Float[Array, "*batch 3"]
 
 
 class PosedFigure(NamedTuple):

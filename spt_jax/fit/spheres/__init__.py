@@ -1,0 +1,1 @@
+"""A body as spheres, for the regularizer of that name."""
