@@ -204,7 +204,7 @@ class RigWriter:
         return glb(self.tree, self.data)
 
 
-def _tube(rings, sectors, radius=10.0, height=100.0, seam=True):
+def tube(rings, sectors, radius=10.0, height=100.0, seam=True):
     """A closed tube along y with its first column twice, as a texture's seam leaves it."""
     columns = sectors + seam
     angle = 2 * np.pi * (np.arange(columns) % sectors) / sectors
@@ -225,7 +225,7 @@ def _tube(rings, sectors, radius=10.0, height=100.0, seam=True):
     return np.array(points, float), np.array(faces)
 
 
-def _quaternion(axis, angle):
+def quaternion(axis, angle):
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     return [*(np.sin(angle / 2) * axis), np.cos(angle / 2)]
 
@@ -237,15 +237,15 @@ def hard_rig(*, mirrored=False):
     # node that is none; a joint with a matrix; one with an uneven scale; and a hung mesh.
     size = [-0.01, 0.01, 0.01] if mirrored else [0.01, 0.01, 0.01]
     matrix = np.eye(4)
-    matrix[:3, :3] = _turn(_quaternion([1, 2, 3], 0.3)) * 1.1
+    matrix[:3, :3] = _turn(quaternion([1, 2, 3], 0.3)) * 1.1
     matrix[:3, 3] = [1, 24, 2]
     nodes = [
-        {"name": "Armature", "rotation": _quaternion([1, 0, 0], -0.4), "scale": size},
-        {"name": "root", "translation": [3, 1, 2], "rotation": _quaternion([0, 1, 1], 0.2)},
+        {"name": "Armature", "rotation": quaternion([1, 0, 0], -0.4), "scale": size},
+        {"name": "root", "translation": [3, 1, 2], "rotation": quaternion([0, 1, 1], 0.2)},
         {"name": "between", "translation": [0, 5, 0], "scale": [1.2, 1.2, 1.2]},
         {"name": "spine", "translation": [0, 20, 1], "scale": [1.0, 0.8, 1.1]},
         {"name": "matrix", "matrix": matrix.T.ravel().tolist()},
-        {"name": "tip", "translation": [0, 22, 0], "rotation": _quaternion([1, 1, 0], 0.5)},
+        {"name": "tip", "translation": [0, 22, 0], "rotation": quaternion([1, 1, 0], 0.5)},
         {"name": "skin A", "mesh": 0, "skin": 0, "translation": [100, 100, 100]},
         {"name": "skin B", "mesh": 1, "skin": 1},
         {"name": "hat", "mesh": 2, "translation": [0, 15, 0], "scale": [0.5, 0.5, 0.5]},
@@ -268,9 +268,9 @@ def hard_rig(*, mirrored=False):
     # The other skin: other joints in another order, another space, and the spine bound elsewhere.
     order = [4, 3, 1]
     bind_b = np.stack([np.linalg.inv(straight[j]) for j in order])
-    bind_b[1] = np.linalg.inv(straight[3] @ _local({"rotation": _quaternion([0, 0, 1], 0.2)}))
+    bind_b[1] = np.linalg.inv(straight[3] @ _local({"rotation": quaternion([0, 0, 1], 0.2)}))
 
-    points, faces = _tube(9, 6)
+    points, faces = tube(9, 6)
     half = np.split(faces, [len(faces) // 2])
     weights = rng.dirichlet(np.ones(8) * 0.4, len(points))
     # A vertex of the seam is one vertex, with one skin.
@@ -316,7 +316,7 @@ def hard_rig(*, mirrored=False):
         }
         for part in half
     ]
-    more, corners = _tube(5, 5, radius=6.0, seam=False)
+    more, corners = tube(5, 5, radius=6.0, seam=False)
     more = (straight[1] @ np.c_[more * 0.7 + [20, 0, 0], np.ones(len(more))].T).T[:, :3]
     if mirrored:
         corners = corners[:, [0, 2, 1]]
@@ -328,7 +328,7 @@ def hard_rig(*, mirrored=False):
         },
         "indices": w.accessor(corners.ravel(), "SCALAR", 5121),
     }
-    hat, brim = _tube(3, 4, radius=8.0, height=10.0, seam=False)
+    hat, brim = tube(3, 4, radius=8.0, height=10.0, seam=False)
     third = {"attributes": {"POSITION": w.accessor(hat, "VEC3")}}
     third["indices"] = w.accessor(brim.ravel(), "SCALAR", 5125)
     w.tree |= {
@@ -354,7 +354,7 @@ def hard_rig(*, mirrored=False):
         ],
     }
     keys = np.array([0.0, 0.4, 1.0])
-    turns = np.array([_quaternion(rng.normal(size=3), a) for a in (0.2, 1.9, -1.2)])
+    turns = np.array([quaternion(rng.normal(size=3), a) for a in (0.2, 1.9, -1.2)])
     spline = np.stack([0.3 * rng.normal(size=(3, 4)), turns, 0.3 * rng.normal(size=(3, 4))], axis=1)
     tracks = [
         (1, "rotation", "LINEAR", turns),

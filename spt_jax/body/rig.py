@@ -37,8 +37,8 @@ class RigModel(AbstractBody):
     mirrors where the character is mirrored), so that the zero pose is the bind pose and axes are
     the world's, as in `BodyModel`.
 
-    Get one from `load_rig`, or from `load_body` with a .glb, .gltf or .vrm file. It goes where
-    bodies go: `untangle_pose`, `untangle_motion`, the penalty with its `rest_surface`.
+    Get one from `load_rig`. It goes where bodies go: `untangle_pose`, `untangle_motion`, the
+    penalty with its `rest_surface`.
 
     Attributes:
         template: vertices in the space in which the skin was bound, in metres.

@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from spt_jax.cli.mesh import untangle_mesh_file
+from spt_jax.cli.rigs import untangle_rig_file
 from spt_jax.cli.terminal import err_console, out_console, progress_bar, show, user_errors
 
 
@@ -36,14 +37,18 @@ def untangle(
     frame that is done is kept in OUT/unfinished until all are: a run that was ended goes on with
     the same command.
 
+    Of a rigged character (.glb, .gltf or .vrm with a skin) every animation is freed; it is written
+    back into the same file, NAME_untangled.glb, as one more animation, and as .npz and .bvh.
+
     Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
     in the same format; the exit code is 1 if something still intersects or overlaps.
 
     Args:
-        poses: the pose file (.npz, .npy, .pkl, .pt, .json, .bvh), or a mesh file.
+        poses: the pose file (.npz, .npy, .pkl, .pt, .json, .bvh), a rig or a mesh file.
         out: folder for the results, made where missing.
         frames: which frames: numbers from 0, ranges and names, such as 0,5,10-12 or crawl/0012
-        people: whose frames, of a file of several: names or numbers from 0, such as 0,2
+        people: whose frames, of a file of several: names or numbers from 0, such as 0,2; of a rig
+            file the one character
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
             (.npz, .pkl).
         folds: of a posed body, what becomes of skin that folds where a joint bends: "ignore" leaves
@@ -63,10 +68,34 @@ def untangle(
         quiet: print errors alone.
     """
     from spt_jax.io.pose_files import is_pose_file
+    from spt_jax.io.rigs.reading import is_rig_file
 
+    with user_errors():
+        rigged = is_rig_file(poses, max_bytes=max_bytes)
+    if rigged:
+        with user_errors():
+            _refuse("a rig", like_input=like_input, body=body != "anny")
+        return untangle_rig_file(
+            poses,
+            out,
+            frames=frames,
+            people=people,
+            options={
+                "rays": rays,
+                "directions": 3,
+                "folds": folds,
+                "fold_distance": fold_distance,
+            },
+            meshes=meshes,
+            anew=anew,
+            max_bytes=max_bytes,
+            json=json,
+            quiet=quiet,
+        )
     if not is_pose_file(poses):
         with user_errors():
-            _refuse_for_mesh(
+            _refuse(
+                "a mesh",
                 frames=frames != "all",
                 people=people != "all",
                 like_input=like_input,
@@ -150,7 +179,7 @@ def untangle(
     return 0
 
 
-def _refuse_for_mesh(**used: bool) -> None:
+def _refuse(what: str, **used: bool) -> None:
     for name, given in used.items():
         if given:
-            raise ValueError(f"{name} is for pose files: got it with a mesh; leave it out.")
+            raise ValueError(f"{name} is for pose files: got it with {what}; leave it out.")

@@ -22,8 +22,9 @@ def view(
     and volume, ratio and milliseconds are shown as you drag. Ends with Ctrl-C.
 
     Args:
-        file: poses (.npz), a mesh (.ply, .obj, .stl, .off, .glb), or an SMPL, SMPL-H or SMPL-X
-            model (.npz, .pkl); the body that comes with the package if not given.
+        file: poses (.npz), a mesh (.ply, .obj, .stl, .off, .glb), a rigged character with its
+            animations (.glb, .gltf, .vrm), or an SMPL, SMPL-H or SMPL-X model (.npz, .pkl); the
+            body that comes with the package if not given.
         port: of the page; the next free one if it is taken.
         host: the address to serve on. Other machines reach a view on 0.0.0.0, without encryption;
             whoever has the address that is printed, with its token, can use it.

@@ -17,6 +17,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.io.pose_files import open_poses as open_poses
     from spt_jax.io.pose_files import read_poses as read_poses
     from spt_jax.io.pose_files import write_poses as write_poses
+    from spt_jax.io.rigs.bvh import write_bvh as write_bvh
     from spt_jax.io.rigs.clips import Clip as Clip
     from spt_jax.io.rigs.exporting import write_rig as write_rig
     from spt_jax.io.rigs.reading import RigFile as RigFile
@@ -42,6 +43,7 @@ __all__ = [
     "read_keypoints",
     "read_mesh",
     "read_poses",
+    "write_bvh",
     "write_mesh",
     "write_poses",
     "write_rig",
@@ -62,6 +64,7 @@ __getattr__, __dir__ = _lazy_names(
         "open_poses": "spt_jax.io.pose_files",
         "read_poses": "spt_jax.io.pose_files",
         "write_poses": "spt_jax.io.pose_files",
+        "write_bvh": "spt_jax.io.rigs.bvh",
         "Clip": "spt_jax.io.rigs.clips",
         "write_rig": "spt_jax.io.rigs.exporting",
         "RigFile": "spt_jax.io.rigs.reading",

@@ -5,16 +5,19 @@ import secrets
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from spt_jax._mesh_check import check_mesh
-from spt_jax.body import BodyModel, load_body, load_mocap
+from spt_jax.body import AbstractBody, RigModel, load_body, load_mocap
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.files.limits import as_file, read_bytes, read_npz
 from spt_jax.io.mesh_files import read_mesh, write_mesh
 from spt_jax.io.pose_files import MotionFile, Track, is_pose_file, open_poses, write_poses
+from spt_jax.io.rigs.arrays import write_rig_poses
+from spt_jax.io.rigs.reading import is_rig_file, load_rigs
 from spt_jax.view.scene import Reading, Scene
 
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}", re.ASCII)
@@ -37,10 +40,18 @@ class Frames:
         scene.load(self.pose[row], shape, translation)
 
 
+class Rigged(NamedTuple):
+    """A rigged character: its scene, its animations as motions, and what was left out."""
+
+    scene: Scene
+    motions: dict[str, Frames]
+    notes: tuple[str, ...]
+
+
 def open_file(
     path: Path, name: str | None = None, *, max_bytes: int | None = None
-) -> Scene | MotionFile:
-    """What a file holds: a mesh or a body as a scene, or poses.
+) -> Scene | MotionFile | Rigged:
+    """What a file holds: a mesh or a body as a scene, a rigged character, or poses.
 
     Args:
         path: .pkl and .npz are an SMPL model where they have `v_template`, otherwise poses, as are
@@ -57,6 +68,8 @@ def open_file(
     path = as_file(path)  # a pipe would be waited for
     if _is_model(path, max_bytes):
         return Scene.of_body(load_body(path, max_bytes=max_bytes), name or path.stem)
+    if is_rig_file(path, max_bytes=max_bytes):
+        return _rigged(path, name, max_bytes)
     if is_pose_file(path):
         return open_poses(path, max_bytes=max_bytes)
     vertices, faces = read_mesh(path, max_bytes=max_bytes)
@@ -64,7 +77,24 @@ def open_file(
     return Scene.of_mesh(vertices, faces, name or path.stem)
 
 
-def open_upload(name: str, content: bytes, *, max_bytes: int | None = None) -> Scene | MotionFile:
+def _rigged(path: Path, name: str | None, max_bytes: int | None) -> Rigged:
+    """The first character of a rig file; what others there are is said."""
+    rigs = load_rigs(path, dtype=np.float32, max_bytes=max_bytes)
+    rig, notes = rigs[0], [*rigs[0].notes]
+    if len(rigs) > 1:
+        notes.append(f"Of {len(rigs)} characters the first is shown, {rig.name}.")
+    motions = {}
+    for clip in (rig.clip(), *map(rig.clip, rig.animations)):
+        names = [clip.name] if clip.frame_rate is None else []
+        names = names or [f"{clip.name}/{row:04d}" for row in range(len(clip.times))]
+        arrays = (x.astype(np.float32) for x in (clip.pose, clip.shape, clip.translation))
+        motions[clip.name] = Frames(names, *arrays)
+    return Rigged(Scene.of_body(rig.body, name or path.stem), motions, tuple(notes))
+
+
+def open_upload(
+    name: str, content: bytes, *, max_bytes: int | None = None
+) -> Scene | MotionFile | Rigged:
     """The same for a file that a browser sent; nothing of it stays on the disk.
 
     On the disk it has a name of our own: of the one that it came with, the suffix says which reader
@@ -110,7 +140,7 @@ def label_of(name: str) -> str:
     return label[-_LONGEST_NAME:] if label.strip(".") else "file"
 
 
-def frames_for(given: Track, body: BodyModel, *, embedded: bool) -> tuple[Frames, list[str]]:
+def frames_for(given: Track, body: AbstractBody, *, embedded: bool) -> tuple[Frames, list[str]]:
     """A track's poses on a body, and what of them had to be left out."""
     notes = []
     shape = given.shape
@@ -134,7 +164,7 @@ def frames_for(given: Track, body: BodyModel, *, embedded: bool) -> tuple[Frames
 
 
 def motions_of(
-    given: MotionFile, name: str, body: BodyModel, *, embedded: bool
+    given: MotionFile, name: str, body: AbstractBody, *, embedded: bool
 ) -> tuple[dict[str, Frames], list[str]]:
     """The people of a file on a body, each a motion, and what had to be left out, once each."""
     motions, notes = {}, list(given.notes)
@@ -145,7 +175,7 @@ def motions_of(
     return motions, list(dict.fromkeys(notes))
 
 
-def mocap_for(body: BodyModel) -> dict[str, Frames]:
+def mocap_for(body: AbstractBody) -> dict[str, Frames]:
     """The motions that come with the package, on a body."""
     mocap = load_mocap()
     poses = np.asarray(body.pose_from_smpl(mocap.pose))
@@ -168,7 +198,7 @@ def mesh_bytes(scene: Scene, reading: Reading) -> bytes:
 
 
 def pose_bytes(scene: Scene) -> bytes:
-    """The pose as an .npz in AMASS' layout, with shape and translation.
+    """The pose as an .npz in AMASS' layout, with shape and translation; of a rig with names.
 
     Raises:
         ValueError: a mesh has no pose.
@@ -177,6 +207,10 @@ def pose_bytes(scene: Scene) -> bytes:
         raise ValueError("pose must come from a body: got a mesh; save it as .glb.")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pose.npz"
+        if isinstance(scene.body, RigModel):
+            rows = (scene.pose[None], scene.shape[None], scene.translation[None])
+            write_rig_poses(path, scene.body, *rows, None)
+            return path.read_bytes()
         write_poses(path, scene.pose, shape=scene.shape, translation=scene.translation)
         return path.read_bytes()
 

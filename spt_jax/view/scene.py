@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, Int8
 from scipy.spatial.transform import Rotation
 
 from spt_jax._query import as_directions
-from spt_jax.body import BodyModel
+from spt_jax.body import AbstractBody
 from spt_jax.io.mesh_files import fits_single
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
 from spt_jax.overlap.labels import LabelCounts, count_labels
@@ -78,7 +78,7 @@ class Scene:
         name: str,
         faces: Int[Any, "F 3"],
         *,
-        body: BodyModel | None = None,
+        body: AbstractBody | None = None,
         vertices: Float[np.ndarray, "V 3"] | None = None,
     ):
         if (body is None) == (vertices is None):
@@ -97,7 +97,7 @@ class Scene:
         self._loaded = self._state()
 
     @classmethod
-    def of_body(cls, body: BodyModel, name: str) -> "Scene":
+    def of_body(cls, body: AbstractBody, name: str) -> "Scene":
         """A body at rest."""
         return cls(name, body.faces, body=body)
 

@@ -223,7 +223,9 @@ class View:
     def _take_upload(self, name: str, content: bytes) -> None:
         self._do("open", "open_upload", name, content)
 
-    def _take(self, opened: Scene | MotionFile, name: str | None, *, first: bool) -> None:
+    def _take(
+        self, opened: Scene | MotionFile | files.Rigged, name: str | None, *, first: bool
+    ) -> None:
         notes: Sequence[str] = ()
         if isinstance(opened, MotionFile):
             scene = self.scene if not first else _embedded_body()
@@ -236,6 +238,11 @@ class View:
                 embedded=self._embedded,
             )
             motions, start = {**shown, **files.mocap_for(scene.body)}, (next(iter(shown)), 0)  # type: ignore
+        elif isinstance(opened, files.Rigged):
+            scene, motions, self._embedded = opened.scene, opened.motions, False
+            start = (list(motions)[min(1, len(motions) - 1)], 0)  # the first animation
+            problems = check_mesh(scene.vertices, scene.faces).problems
+            notes = [*opened.notes, *problems]
         else:
             scene = opened
             self._embedded = name is None

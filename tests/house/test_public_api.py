@@ -174,6 +174,7 @@ NAMESPACES = {
         "read_keypoints",
         "read_mesh",
         "read_poses",
+        "write_bvh",
         "write_mesh",
         "write_poses",
         "write_rig",
