@@ -1,4 +1,4 @@
-"""Whether a mesh is one that the penalty can judge: closed, consistently wound, right side out."""
+"""Whether a mesh is one that the penalty can judge: closed but for holes, rightly wound."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax._query import as_mesh
+from spt_jax.overlap.caps import LARGEST, Hole, closed_surface, holes_in_words, holes_of
 from spt_jax.overlap.topology import Edges, count_loops, distinct
+from spt_jax.overlap.triangles.manifold import manifold_of
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,17 @@ class MeshCheck:
         duplicate_faces: faces that repeat an earlier one in the same sense.
         boundary_edges: edges of one face only.
         holes: loops of boundary edges; loops that touch at a vertex are one.
+        largest_hole: the loop that is largest beside the part around it: its `edges`, `length` and
+            `size`, the area of a disk with such a rim against that of the part. Up to 0.75 a fan to
+            the mean of its vertices closes it; no flat sheet has less than 1, a hemisphere 0.5.
+        open_sheets: connected parts with a loop that is too large to be closed.
         misoriented_edges: edges that both of their two faces run through in the same sense.
         nonmanifold_edges: edges of more than two faces.
         unbalanced_edges: those of them that are run through more often one way than the other.
         nonmanifold_vertices: vertices whose faces form more than one fan.
         components: parts connected through edges.
-        inverted_components: closed parts of negative volume, not within the bounding box of an
-            outward one.
+        inverted_components: parts, closed or closed by fans, of negative volume, not within the
+            bounding box of an outward one.
         inward_components: closed parts of negative volume within such a box: cavities, if they
             lie inside that part.
         unreferenced_vertices: vertices of no face.
@@ -42,8 +48,10 @@ class MeshCheck:
         >>> from spt_jax import check_mesh
         >>> box = trimesh.creation.box()
         >>> found = check_mesh(box.vertices, box.faces[1:])  # a triangle is missing
-        >>> found.holes, found.boundary_edges, len(found.problems)
-        (1, 3, 1)
+        >>> found.holes, found.boundary_edges, found.ok  # it is closed by a fan
+        (1, 3, True)
+        >>> print(found.warnings[0])
+        1 hole of 3 edges, 3.41 long, 16.9% of its part: closed by fans
     """
 
     num_vertices: int
@@ -54,6 +62,8 @@ class MeshCheck:
     duplicate_faces: int = 0
     boundary_edges: int = 0
     holes: int = 0
+    largest_hole: Hole | None = None
+    open_sheets: int = 0
     misoriented_edges: int = 0
     nonmanifold_edges: int = 0
     unbalanced_edges: int = 0
@@ -85,13 +95,15 @@ class MeshCheck:
         """
         if not self.ok:
             raise ValueError(
-                "mesh must be closed, consistently wound and right side out: got "
+                "mesh must be closed but for holes, consistently wound and right side out: got "
                 + "; ".join(self.problems)
             )
 
     def as_dict(self) -> dict[str, Any]:
         """All counts, problems and warnings, and whether the mesh is `ok`, as JSON types."""
-        return {"ok": self.ok, **asdict(self)}
+        hole = self.largest_hole
+        named = None if hole is None else {k: getattr(hole, k) for k in ("edges", "length", "size")}
+        return {"ok": self.ok, **asdict(self), "largest_hole": named}
 
     def __str__(self) -> str:
         return "\n".join([self._headline(), *(f"  {mark} {text}" for mark, text in self._lines())])
@@ -148,8 +160,8 @@ def check_mesh(
         >>> box = trimesh.creation.box()
         >>> print(check_mesh(box.vertices, box.faces))
         mesh: 8 vertices, 12 faces, 1 component; fit for the penalty
-        >>> check_mesh(box.vertices, box.faces[1:]).boundary_edges
-        3
+        >>> print(check_mesh(box.vertices, box.faces[:4]).problems[0].split(",")[0])
+        an open sheet: 1 hole of 6 edges
     """
     given, triangles = one_mesh(vertices, faces, counting=True)
     points = np.asarray(given, np.float64)
@@ -161,7 +173,13 @@ def check_mesh(
     edges = Edges(surface)
     part = edges.components()
     closed = ~np.isin(part, part[edges.face[edges.imbalance[edges.edge] != 0]])
-    inverted, inward = _inside_out(points, surface, part, closed)
+    holes = _holes(points, surface, edges, finite)
+    sheets = {hole.part for hole in holes if not hole.is_closed}
+    filled, whole, of_whole = points, surface, part
+    if holes and not sheets:  # fans close all that is open
+        filled, whole, beside = closed_surface(manifold_of(surface, len(points)), points, surface)
+        of_whole, closed = part[beside], np.ones(len(whole), bool)
+    inverted, inward = _inside_out(filled, whole, of_whole, closed)
     used = np.zeros(len(points), bool)
     used[usable] = True
     corners = np.unique(surface)
@@ -174,6 +192,8 @@ def check_mesh(
         duplicate_faces=len(usable) - _total(degenerate) - len(surface),
         boundary_edges=_total(edges.faces == 1),
         holes=count_loops(edges.ends[edges.faces == 1]),
+        largest_hole=max(holes, key=lambda hole: hole.size, default=None),
+        open_sheets=len(sheets),
         misoriented_edges=_total((edges.faces == 2) & (edges.imbalance != 0)),
         nonmanifold_edges=_total(edges.faces > 2),
         unbalanced_edges=_total((edges.faces > 2) & (edges.imbalance != 0)),
@@ -184,6 +204,14 @@ def check_mesh(
         unreferenced_vertices=_total(~used),
         euler_number=len(corners) - len(edges.faces) + len(surface),
     )
+
+
+def _holes(points, surface, edges: Edges, finite) -> list[Hole]:
+    """The loops of boundary edges, where nothing else is wrong along them."""
+    rim = edges.ends[edges.faces == 1]
+    if not len(rim) or not finite[surface].all() or (edges.imbalance[edges.faces == 2] != 0).any():
+        return []
+    return holes_of(manifold_of(surface, len(points)), points)
 
 
 def one_mesh(vertices, faces, counting: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -247,12 +275,20 @@ def _problems(check: MeshCheck) -> Iterable[str]:
             f"{_count(n, 'face')} listed more than once; with trimesh: "
             "mesh.update_faces(mesh.unique_faces())"
         )
-    if n := check.boundary_edges:
+    if (n := check.open_sheets) and check.largest_hole is not None:
+        what = "an open sheet" if n == 1 else f"{n} open sheets"
+        hole = holes_in_words(check.holes, check.largest_hole)
         yield (
-            f"{_count(n, 'boundary edge')} around {_count(check.holes, 'hole')}: the surface is "
-            "open; with trimesh: mesh.merge_vertices(merge_tex=True, merge_norm=True) if it is "
-            "only split along seams, else trimesh.repair.fill_holes(mesh, use_fan=True), and a "
-            "mesh editor for what is left"
+            f"{what}: {hole}, where up to {LARGEST:.0%} is closed by a fan; it "
+            "encloses nothing. With trimesh: mesh.merge_vertices(merge_tex=True, "
+            "merge_norm=True) if it is only split along seams; beside solids, sheet_penalty "
+            "measures how much of it lies in them; else thicken it, or close it: "
+            "trimesh.repair.fill_holes(mesh, use_fan=True)"
+        )
+    elif check.boundary_edges and check.largest_hole is None:
+        yield (
+            f"{_count(check.boundary_edges, 'boundary edge')} around "
+            f"{_count(check.holes, 'hole')} that cannot be closed before the rest is put right"
         )
     if n := check.misoriented_edges:
         yield (
@@ -275,6 +311,8 @@ def _problems(check: MeshCheck) -> Iterable[str]:
 def _warnings(check: MeshCheck) -> Iterable[str]:
     if not check.num_faces:
         yield "no faces: there is nothing that could intersect"
+    if check.largest_hole is not None and not check.open_sheets:
+        yield f"{holes_in_words(check.holes, check.largest_hole)}: closed by fans"
     if n := check.nonmanifold_edges - check.unbalanced_edges:
         yield f"{_count(n, 'non-manifold edge')} with as many faces one way as the other"
     if n := check.nonmanifold_vertices:

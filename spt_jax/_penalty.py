@@ -65,7 +65,8 @@ def self_intersection_penalty(
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
             must be closed and consistently wound (`check_mesh` tells); it need not be connected.
-            Holes are closed by a fan to the mean of their boundary's vertices.
+            Holes are closed by a fan to the mean of their boundary's vertices, if they are small
+            beside the part around them (`check_mesh`); an open sheet encloses nothing: NaN.
         value: "volume", in the cube of the unit, or "ratio", the paper's Eq. 11: the part of the
             vertices in self-intersection, piecewise constant and not what the gradient derives.
         gradient: "boundary", the derivative of the volume; "vertex", the paper's Eq. 9, which

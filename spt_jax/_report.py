@@ -9,6 +9,7 @@ from spt_jax._exclusions import as_exclusions
 from spt_jax._mesh_check import one_mesh
 from spt_jax._query import as_choice, as_directions, as_rays
 from spt_jax._result import Result
+from spt_jax.overlap.caps import Hole, holes_in_words
 from spt_jax.overlap.labels import count_labels
 from spt_jax.overlap.measure import Rule, Sampling, measure
 from spt_jax.overlap.rays.beam import Rays
@@ -34,9 +35,11 @@ class IntersectionReport(Result):
         rays: as requested: None (exact), rays along the longer side of each screen, or
             (rows, columns).
         crossings: of rays with triangles, for each beam; none where no rays were needed.
-        open_rays: rays of each beam that met a hole and were left out.
         exact: whether the volume is exact. False with `rays`, and where the exact sums were found
             not to close, which no closed mesh has been seen to do: then 512 rays are cast.
+        holes: the boundary loops that were closed by fans to the mean of their vertices, the
+            largest first: how many edges each has, its length, and its size, the area of a disk
+            with such a rim against that of the part around it.
 
     Example:
         >>> import trimesh
@@ -58,8 +61,8 @@ class IntersectionReport(Result):
     total_intersecting_pairs: int
     rays: Rays
     crossings: tuple[int, ...]
-    open_rays: tuple[int, ...]
     exact: bool
+    holes: tuple[Hole, ...] = ()
 
     @property
     def num_penetrating(self) -> int:
@@ -100,12 +103,14 @@ class IntersectionReport(Result):
             "num_penetrating": self.num_penetrating,
             "num_inverted": self.num_inverted,
             "num_clear": self.num_clear,
+            "holes": [
+                {"edges": hole.edges, "length": hole.length, "size": hole.size}
+                for hole in self.holes
+            ],
             "rays": list(self.rays) if isinstance(self.rays, tuple) else self.rays,
             "beams": [
-                {"direction": list(d), "volume": v, "crossings": n, "open_rays": o}
-                for d, v, n, o in zip(
-                    self.directions, self.volumes, self.crossings, self.open_rays, strict=False
-                )
+                {"direction": list(d), "volume": v, "crossings": n}
+                for d, v, n in zip(self.directions, self.volumes, self.crossings, strict=False)
             ],
         }
 
@@ -121,6 +126,8 @@ class IntersectionReport(Result):
         if self.total_volume != self.volume or counted != pairs:
             table.add_row("with what is excluded", f"{self.total_volume:.4g} unit³")
         table.add_row("solid volume", f"{self.solid_volume:.4g} unit³")
+        if self.holes:
+            table.add_row("holes closed", holes_in_words(len(self.holes), self.holes[0], "unit"))
         table.add_row("ratio (Eq. 11)", f"{self.ratio:.3%} of {len(self.labels)} vertices")
         table.add_row(
             "vertices",
@@ -129,12 +136,11 @@ class IntersectionReport(Result):
         )
         ignored = f", {pairs - counted} more excluded" if pairs > counted else ""
         table.add_row("intersecting pairs", f"{counted}{ignored}")
-        for direction, volume, crossings, lost in zip(
-            self.directions, self.volumes, self.crossings, self.open_rays, strict=False
+        for direction, volume, crossings in zip(
+            self.directions, self.volumes, self.crossings, strict=False
         ):
             axis = _axis_name(direction)
-            note = f", [red]{lost} rays through a hole left out[/red]" if lost else ""
-            table.add_row(f"along {axis}", f"{volume:.4g} unit³, {crossings:,} crossings{note}")
+            table.add_row(f"along {axis}", f"{volume:.4g} unit³, {crossings:,} crossings")
         return table
 
 
@@ -153,8 +159,7 @@ def intersection_report(
 
     The numbers are those of `self_intersection_penalty` and `classify_vertices`, measured in
     float64 whatever the dtype of the vertices. Where rays are cast, the spread between directions
-    tells the error of the volume, and rays through a hole say that the mesh is not closed
-    (`check_mesh` says where to begin).
+    tells the error of the volume. Holes are closed, and listed; `check_mesh` says more of them.
 
     Args:
         vertices: positions of one mesh, in any unit.
@@ -169,7 +174,7 @@ def intersection_report(
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`, and ValueError for a batch or for
-            vertices that are not finite.
+            vertices that are not finite or a hole that is too large to be closed.
 
     Differentiation: none; for use outside jit.
 
@@ -194,7 +199,7 @@ def intersection_report(
     return IntersectionReport(
         volume=found.volume,
         total_volume=found.total_volume,
-        solid_volume=_solid_volume(points, triangles),
+        solid_volume=_solid_volume(*found.closed[:2]),
         directions=sampling.directions,
         volumes=tuple(found.volumes),
         labels=found.labels(wanted),
@@ -202,8 +207,8 @@ def intersection_report(
         total_intersecting_pairs=found.total_intersecting_pairs,
         rays=sampling.rays,
         crossings=tuple(beam.crossings for beam in found.beams),
-        open_rays=tuple(beam.open_rays for beam in found.beams),
         exact=found.exact,
+        holes=tuple(sorted(found.holes, key=lambda hole: -hole.size)),
     )
 
 

@@ -51,11 +51,15 @@ def test_holes_and_their_edges():
     one_face = faces[1:]
     apart = faces[np.abs(vertices[faces].mean(axis=1)[:, 2]) < 0.9]  # both poles cut off
     check = check_mesh(vertices, one_face)
-    assert counts(check) == {"boundary_edges": 3, "holes": 1}
+    assert check.holes == 1 and check.boundary_edges == check.largest_hole.edges == 3 and check.ok
     check = check_mesh(vertices, apart)
-    assert check.holes == 2 and check.boundary_edges > 6 and not check.ok
+    assert check.holes == 2 and check.boundary_edges > 6 and check.ok
     assert check.unreferenced_vertices == len(vertices) - len(np.unique(apart))
-    assert "around 2 holes" in str(check) and "fill_holes" in check.problems[0]
+    assert "2 holes, the largest of 12 edges" in str(check)
+    assert check_mesh(vertices, apart[:, ::-1]).inverted_components == 1
+    ring = faces[np.abs(vertices[faces].mean(axis=1)[:, 2]) < 0.2]
+    check = check_mesh(vertices, ring)
+    assert not check.ok and check.open_sheets == 1 and "fill_holes" in check.problems[0]
 
 
 def test_faces_turned_round():
@@ -207,7 +211,7 @@ def test_the_check_prints_in_colour():
     vertices, faces = box()
     console = Console(width=400, color_system="standard", force_terminal=True)
     with console.capture() as capture:
-        console.print(check_mesh(vertices, np.concatenate([faces[1:], [[0, 0, 1]]])))
+        console.print(check_mesh(vertices, np.concatenate([faces, faces[:1], [[0, 0, 1]]])))
     text = capture.get()
     assert "\x1b[31m  problem:" in text and "\x1b[33m  warning:" in text
 
@@ -216,14 +220,14 @@ def test_report_of_two_spheres_in_closed_form():
     pair = join(sphere(), sphere(center=(1.0, 0.2, 0.1)))
     report = intersection_report(*pair)
     distance = np.sqrt(1 + 0.04 + 0.01)
-    assert report.rays is None and report.crossings == report.open_rays == ()  # none needed
+    assert report.rays is None and report.crossings == ()  # none needed
     assert report.intersecting_pairs == report.total_intersecting_pairs > 100
     assert report.volume == report.total_volume
     assert report.volume == pytest.approx(lens_volume(distance), rel=0.02)
     assert report.solid_volume == pytest.approx(as_trimesh(pair).volume)
     assert set(report.volumes) == {report.volume}
     seen = intersection_report(*pair, rays=512)
-    assert seen.open_rays == (0, 0, 0) and min(seen.crossings) > 4e5
+    assert min(seen.crossings) > 4e5
     assert seen.volume == pytest.approx(report.volume, rel=2e-3)
     assert report.num_penetrating + report.num_clear == len(pair[0]) and report.num_inverted == 0
     assert not report.is_free
@@ -254,10 +258,15 @@ def test_report_far_from_the_origin():
     assert report.solid_volume == pytest.approx(2, rel=1e-6)
 
 
-def test_report_counts_rays_through_holes():
+def test_report_lists_the_holes_that_it_closes():
     vertices, faces = box()
-    report = intersection_report(vertices, faces[1:], rays=64)
-    assert sum(report.open_rays) > 500 and "rays through a hole left out" in str(report)
+    report = intersection_report(vertices, faces[1:])
+    assert report.solid_volume == pytest.approx(1) and report.is_free
+    (hole,) = report.as_dict()["holes"]
+    assert hole["edges"] == 3 and hole["length"] == pytest.approx(2 + np.sqrt(2))
+    assert "1 hole of 3 edges, 3.41 unit long, 16.9% of its part" in str(report)
+    with pytest.raises(ValueError, match="open sheet, which encloses nothing"):
+        intersection_report(vertices, faces[:4])
 
 
 def test_report_as_table_and_as_json():
@@ -267,7 +276,7 @@ def test_report_as_table_and_as_json():
     assert "\x1b" not in text and text == "\n".join(x.rstrip() for x in text.splitlines())
     found = json.loads(json.dumps(report.as_dict()))
     assert found["volume"] == report.volume and found["num_penetrating"] == report.num_penetrating
-    assert len(found["beams"]) == 1 and found["beams"][0]["open_rays"] == 0
+    assert len(found["beams"]) == 1 and found["beams"][0]["crossings"] == report.crossings[0]
 
 
 def test_report_refuses_what_the_penalty_refuses():

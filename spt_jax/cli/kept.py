@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spt_jax._report import IntersectionReport
+from spt_jax.overlap.caps import Hole
 
 if TYPE_CHECKING:
     from spt_jax.cli.annotated import Annotated
@@ -85,9 +86,9 @@ def _report_facts(report: IntersectionReport) -> dict[str, Any]:
 
 
 def _report(facts: Mapping[str, Any], labels: np.ndarray) -> IntersectionReport:
-    return IntersectionReport(
-        labels=labels, **{name: _as_tuples(value) for name, value in facts.items()}
-    )
+    values = {name: _as_tuples(value) for name, value in facts.items()}
+    holes = tuple(Hole(*hole) for hole in values.pop("holes"))
+    return IntersectionReport(labels=labels, holes=holes, **values)
 
 
 def _as_tuples(value: Any) -> Any:

@@ -135,7 +135,7 @@ def _with_hands(
             f"the body has {what} of the {side} hand, the file {given.shape[1]}: those fingers are "
             "at rest"
         )
-    return np.asarray(model.with_hands(pose, **used))
+    return np.asarray(model.with_hands(pose, used.get("left"), used.get("right")))
 
 
 def _rows(asked: Chosen) -> list[tuple[int, list[int]]]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.caps import beside_caps
 from spt_jax.overlap.exclusions import NOTHING, Exclusions, pair_weights
 from spt_jax.overlap.surface import ExactSurface, Layer, regions_of
 from spt_jax.overlap.triangles.closed_form import gradient_of, volumes_of
@@ -63,6 +64,9 @@ class ExactOverlap:
         for layer in self._layers[1:]:
             on = np.flatnonzero(layer.segments)
             weight[on] = pair_weights(self._exclusions, *self.surface.pairs[on].T)
+            if self.surface.manifold.num_fans:
+                pairs = self.surface.contours.pair[on]
+                weight[on] *= ~beside_caps(self.surface.manifold, *pairs.T)
         return weight * self.surface.proper
 
     @cached_property

@@ -8,7 +8,8 @@ in a head, are meant to, and do not count.
 Within one part the intersection contours decide. A region of overlap counts with the share of its
 contour's length along which the intersecting triangles are far from each other at rest: wholly
 where all of it is, as for two limbs; not at all where none is, as for the crease of a bent elbow;
-and in part where a fold and a collision hang together.
+and in part where a fold and a collision hang together. Where a hole was closed by a fan, what the
+fan meets beside the hole is a fold, too, whatever else counts (`caps.py`).
 
 Rays that were asked for tell intervals one by one: an interval in a region that counts does so
 where its four sheets may collide: the two solids that overlap there either cross or lie one in the
@@ -85,24 +86,27 @@ class PartRules:
         face: one of the faces given, for each part.
         ignored: the table.
         rest: the surface at rest.
+        capped: parts with holes that fans close: what a fan meets of its own may be a fold.
     """
 
     group: Int[np.ndarray, "P"]
     face: Int[np.ndarray, "P"]
     ignored: Bool[np.ndarray, "G G"]
     rest: Any
+    capped: Bool[np.ndarray, "P"]
 
     def __call__(
         self, first: Int[np.ndarray, "N"], second: Int[np.ndarray, "N"]
     ) -> Bool[np.ndarray, "N 2"]:
         """Whether overlaps of two parts count whole, and whether the contour judges them."""
+        same = first == second
         judged = (self.group[first] < 0) | (self.group[second] < 0)
         dropped = ~judged & self.ignored[self.group[first], self.group[second]]
         if self.rest is not None:
             f, g = self.face[first], self.face[second]
-            same = first == second
             dropped |= ~same & self.rest.overlap_at_rest(f, g)
             judged |= same | np.isfinite(self.rest.between_faces(f, g))
+        judged |= same & self.capped[first]
         judged &= ~dropped
         return np.stack([~judged & ~dropped, judged], axis=1)
 
@@ -123,7 +127,9 @@ def part_rules(exclusions: Exclusions, manifold: Manifold) -> PartRules:
         np.maximum.at(high, part, of_face)
         group = np.where(low == high, low, -1)
         group[low == len(ignored)] = 0
-    return PartRules(group, face, ignored, exclusions.rest)
+    capped = np.zeros(manifold.num_parts, bool)
+    capped[part[manifold.kept < 0]] = True
+    return PartRules(group, face, ignored, exclusions.rest, capped)
 
 
 def pair_weights(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
+from spt_jax.overlap.caps import Closed, Hole, closed_surface, holes_of, open_sheets
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.exclusions import NOTHING, Exclusions, Rims, counted_intervals, judged_rims
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
@@ -15,6 +16,7 @@ from spt_jax.overlap.rays.beam import Beam, Rays, aim
 from spt_jax.overlap.rays.crossings import cast
 from spt_jax.overlap.rays.levels import Overlaps, find_overlaps
 from spt_jax.overlap.surface import ExactSurface, regions_of
+from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
 from spt_jax.overlap.triangles.near_triangles import Entangled
 
 Directions = tuple[tuple[float, float, float], ...]
@@ -53,14 +55,12 @@ class Probe:
         overlaps: the overlaps that count.
         everything: those and the ones that are left out.
         crossings: of rays with triangles.
-        open_rays: rays that met a hole and were left out.
     """
 
     beam: Beam
     overlaps: Overlaps
     everything: Overlaps
     crossings: int
-    open_rays: int
 
     @property
     def volume(self) -> float:
@@ -103,6 +103,21 @@ class Measurement:
         except Entangled as tangle:
             raise Unmeasurable(str(tangle)) from None
 
+    @property
+    def manifold(self) -> Manifold:
+        """The surface closed and cut into sheets."""
+        return manifold_of(self.faces, len(self.vertices))
+
+    @cached_property
+    def closed(self) -> Closed:
+        """The surface with fans in place of its holes."""
+        return closed_surface(self.manifold, self.vertices, self.faces)
+
+    @property
+    def holes(self) -> list[Hole]:
+        """The boundary loops, which fans close."""
+        return holes_of(self.manifold, self.vertices)
+
     @cached_property
     def overlap(self) -> ExactOverlap:
         """What counts, from the triangles alone."""
@@ -127,9 +142,13 @@ class Measurement:
             return []
         found = [self._along(direction) for direction in self.sampling.directions]
         if self.exclusions.any:
-            counted = counted_intervals(
-                self.exclusions, self._rims, [probe.everything for probe in found]
-            )
+            beside = np.append(self.closed.beside, -1)
+            named = [
+                replace(probe.everything, ends=beside[all_.ends], around=beside[all_.around])
+                for probe in found
+                for all_ in [probe.everything]
+            ]
+            counted = counted_intervals(self.exclusions, self._rims, named)
             found = [
                 replace(probe, overlaps=probe.everything.only(kept))
                 for probe, kept in zip(found, counted, strict=True)
@@ -138,14 +157,15 @@ class Measurement:
 
     def _along(self, direction: tuple[float, float, float]) -> Probe:
         rays = self.sampling.rays if self.sampling.rays is not None else _FALLBACK_RAYS
-        beam, points = aim(self.vertices, np.array(direction), rays)
-        crossings = cast(beam, points, self.faces, simple_rays=False)
-        overlaps = find_overlaps(beam, points, self.faces, crossings)
-        return Probe(beam, overlaps, overlaps, crossings.met, crossings.open_rays)
+        vertices, faces, _ = self.closed
+        beam, points = aim(vertices, np.array(direction), rays)
+        crossings = cast(beam, points, faces, simple_rays=False)
+        overlaps = find_overlaps(beam, points, faces, crossings)
+        return Probe(beam, overlaps, overlaps, crossings.met)
 
     @property
     def _rims(self) -> Rims:
-        (layer,) = self.surface.layers(NOTHING)
+        (layer,) = self.surface.layers(None)
         region, count = regions_of(self.surface, layer)
         of_face = np.full(len(self.faces), -1)
         of_face[self.surface.manifold.beside[layer.shares.faces]] = region
@@ -188,7 +208,8 @@ class Measurement:
         if rule == "vertex":
             return np.sign(self.overlap.winding).astype(np.int8)
         overlaps = [found.overlaps for found in self.beams]
-        label = triangle_labels(self.faces, overlaps, len(self.vertices))
+        vertices, faces, _ = self.closed
+        label = triangle_labels(faces, overlaps, len(vertices))[: len(self.vertices)]
         if self.exact:
             add_labels_without_rays(label, self.faces, *self.overlap.areas())
             label = self.surface.of_given(label)
@@ -201,13 +222,15 @@ class Measurement:
             return vertex_gradient(self.vertices, self.faces, label, unit=kind == "unit")
         if self.exact:
             return self.overlap.gradient()
-        total = np.zeros(self.vertices.shape)
+        vertices, faces, _ = self.closed
+        total = np.zeros(vertices.shape)
         directions = np.array([found.beam.direction for found in self.beams])
         for found in self.beams:
-            total += boundary_gradient(
-                self.vertices, self.faces, found.beam, found.overlaps, directions
-            )
-        return total
+            total += boundary_gradient(vertices, faces, found.beam, found.overlaps, directions)
+        own, loops = total[: len(self.vertices)], self.manifold.loops
+        for loop, force in zip(loops, total[len(own) :], strict=False):
+            own[loop] += force / len(loop)
+        return own
 
 
 def measure(
@@ -228,10 +251,14 @@ def measure(
 
     Raises:
         Unmeasurable: a coordinate that is not finite, a face out of range, coordinates whose cubes
-            overflow or vanish, a mesh so far from the origin that rounding has eaten its shape, or
-            so crumpled that its intersections are too many to be listed.
+            overflow or vanish, a hole that is too large to be closed, a mesh so far from the origin
+            that rounding has eaten its shape, or so crumpled that its intersections are too many to
+            be listed.
     """
     check_usable(vertices, faces, rounding)
+    reason = open_sheets(manifold_of(faces, len(vertices)), vertices)
+    if reason is not None:
+        raise Unmeasurable(reason)
     found = Measurement(vertices, faces, sampling, exclusions, rounding)
     if sampling.rays is None or exclusions.any:
         _ = found.surface  # rays alone need none

@@ -81,7 +81,7 @@ class ExactSurface:
         placed = self.manifold.place(vertices)
         # Of parts that lie on each other, vertex on vertex, one is measured for all.
         self.parts_times = self.times = self._listed = None
-        if merged and self.manifold.num_parts > 1:
+        if merged and self.manifold.num_parts > 1 and not self.manifold.num_fans:
             first, sense = self.manifold.copies(placed)
             if (first != np.arange(len(first))).any():
                 self._merge(first, sense)
@@ -166,10 +166,17 @@ class ExactSurface:
             return int(np.count_nonzero(on))
         return int(self._listed[self.contours.pair[on]].prod(axis=1).sum())
 
-    def layers(self, exclusions: Exclusions) -> list[Layer]:
-        """The overlaps that count whole, and those that are judged by their contours."""
+    def layers(self, exclusions: Exclusions | None) -> list[Layer]:
+        """The overlaps that count whole, and those that are judged by their contours.
+
+        Args:
+            exclusions: what does not count; None: every overlap does, those of fans with what is
+                beside them, too.
+        """
         faces, part = self._faces, self.manifold.part
-        rules = None if not exclusions.any else part_rules(exclusions, self.manifold)
+        rules = None
+        if exclusions is not None and (exclusions.any or self.manifold.num_fans):
+            rules = part_rules(exclusions, self.manifold)
 
         def counted(first, second):
             if rules is None:
@@ -249,7 +256,7 @@ class ExactSurface:
         """w_out around each new vertex on one layer, where contact is no overlap."""
         part = self.manifold.part
         counts = np.ones(len(self.contacts.vertex), bool)
-        if exclusions.any and len(counts):
+        if (exclusions.any or self.manifold.num_fans) and len(counts):
             first = part[self.contacts.vertex]
             second = part[self._faces[self.contacts.face, 0]]
             counts = part_rules(exclusions, self.manifold)(first, second)[:, layer.column]

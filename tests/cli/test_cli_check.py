@@ -69,7 +69,7 @@ def test_check_of_a_mesh_that_intersects_itself(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("mesh", "seen"),
     [
-        ((box()[0], box()[1][1:]), "3 boundary edges around 1 hole"),
+        ((box()[0], box()[1][:4]), "an open sheet: 1 hole of"),
         (inverted(box()), "1 inverted component of 1"),
         ((box()[0], np.concatenate([box()[1][1:], box()[1][:1, ::-1]])), "3 edges that both"),
     ],
@@ -103,8 +103,11 @@ def test_check_as_json(tmp_path, capsys):
     assert clean["mesh"]["components"] == 1 and clean["intersection"]["volume"] == 0
     pair = checked(write(tmp_path / "b.ply", join(box(), box(center=(0.5, 0, 0)))), 1)
     assert pair["intersection"]["volume"] == pytest.approx(0.5, rel=0.1)
-    hole = checked(write(tmp_path / "c.ply", (box()[0], box()[1][1:])), 2)
-    assert hole["mesh"]["boundary_edges"] == 3 and hole["intersection"] is None
+    hole = checked(write(tmp_path / "c.ply", (box()[0], box()[1][1:])), 0)
+    assert hole["mesh"]["boundary_edges"] == hole["mesh"]["largest_hole"]["edges"] == 3
+    assert hole["intersection"]["holes"][0]["edges"] == 3 and hole["mesh"]["ok"]
+    sheet = checked(write(tmp_path / "s.ply", (box()[0], box()[1][:4])), 2)
+    assert sheet["mesh"]["open_sheets"] == 1 and sheet["intersection"] is None
     missing = checked(tmp_path / "d.ply", 2)
     assert "must exist" in missing["error"] and missing["mesh"] is None
 

@@ -303,7 +303,6 @@ def no_overlap(vertices, *_, **__):
         total_intersecting_pairs=3,
         rays=None,
         crossings=(),
-        open_rays=(),
         exact=True,
     )
 

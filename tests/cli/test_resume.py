@@ -21,6 +21,7 @@ from spt_jax.cli.kept import frame_arrays, frame_of
 from spt_jax.cli.main import main
 from spt_jax.cli.unfinished import UnfinishedRun, digest, manifest_of
 from spt_jax.fit.result import FitResult
+from spt_jax.overlap.caps import Hole
 
 NAMES = ["walk/0005", "punch/0013"]
 
@@ -213,7 +214,7 @@ def test_a_frame_comes_back_to_the_bit(rng):
         "intersecting_pairs": 1,
         "total_intersecting_pairs": 2,
     }
-    report |= {"crossings": (), "open_rays": (), "exact": True, "rays": (3, 4)}
+    report |= {"crossings": (), "exact": True, "holes": (Hole(9, 0.3, 0.1, 0),), "rays": (3, 4)}
     from spt_jax._report import IntersectionReport
     from spt_jax.cli.frames import Frame
 
