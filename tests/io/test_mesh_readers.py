@@ -157,7 +157,7 @@ def test_corners_are_joined_within_rounding_and_not_beyond(double):
         points = vertices.copy()
         points[7] += moved
         joined, triangles, rows, collapsed = closed_seams(points, faces, double)
-        assert check_mesh(joined, triangles).ok == closed and collapsed == 0
+        assert (check_mesh(joined, triangles).holes == 0) == closed and collapsed == 0
         assert len(joined) == (8 if closed else 9)
         assert np.abs(joined[rows] - points).max() <= moved
 

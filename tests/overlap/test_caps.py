@@ -123,7 +123,7 @@ def test_a_tongue_through_the_mouth_counts():
     """What comes from farther away than the hole is wide, as a fist that is put into it."""
     vertices, faces = tube(0.5, 6.0)[:2]
     top = vertices[:, 2] > 0
-    vertices, faces = trimesh.remesh.subdivide_to_size(vertices, faces, 0.35)
+    vertices, faces = trimesh.remesh.subdivide_to_size(vertices, faces, 0.35)[:2]
     # Bent round so that one end looks into the other, whose rim it enters.
     angle = vertices[:, 2] / 6.0 * 2 * np.pi * 0.985
     reach = 1.2 + vertices[:, 0] * (1 - 0.5 * (vertices[:, 2] + 3) / 6)
