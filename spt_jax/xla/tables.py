@@ -1,4 +1,4 @@
-r"""What the device path knows from outside, as arrays: operands of its programs, never part of them.
+r"""What the device path knows from outside, as arrays: operands of its programs, not part of them.
 
 Programs are compiled for shapes alone, so calls that differ in directions, groups or distances
 share one. Every table is a look-up by face:
