@@ -165,7 +165,7 @@ def slow_vertices(content, animation=None, time=0.0):
             j = np.hstack([slow_accessor(tree, buffers, attributes[f"JOINTS_{n}"]) for n in sets])
             w = np.hstack([slow_accessor(tree, buffers, attributes[f"WEIGHTS_{n}"]) for n in sets])
             for p, own, weight in zip(points, j.astype(int), w, strict=True):
-                matrix = sum(x * motion[m] for m, x in zip(own, weight, strict=True))
+                matrix = np.einsum("k,kab->ab", weight, np.array(motion)[own])
                 found.append((matrix @ [*p, 1])[:3] / weight.sum())
     return np.array(found)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from spt_jax._report import IntersectionReport
-    from spt_jax.body import BodyModel
+    from spt_jax.body import AbstractBody
     from spt_jax.cli.unfinished import UnfinishedRun
     from spt_jax.untangle.pose import Folds
 
@@ -65,7 +65,7 @@ def made_from(motion: Motion) -> list[tuple[str, list[Any]]]:
 
 
 def untangle_frames(
-    body: "BodyModel",
+    body: "AbstractBody",
     motion: Motion,
     *,
     rays: int | None,

@@ -248,7 +248,7 @@ class View:
             self._embedded = name is None
             motions = {} if scene.body is None else files.mocap_for(scene.body)
             if scene.body is not None and not self._embedded:
-                notes = check_mesh(np.asarray(scene.body.template), scene.faces).problems
+                notes = check_mesh(np.asarray(scene.body.template), scene.faces).problems  # type: ignore
             start = (_FIRST[0], motions[_FIRST[0]].names.index(_FIRST[1])) if motions else None
         if start is not None:
             motions[start[0]].load_into(scene, start[1])
