@@ -9,6 +9,7 @@ import jax
 
 from spt_jax.bridge import on_host
 from spt_jax.bridge.bounded_jit import BoundedJit
+from spt_jax.overlap.host_curvature import Curvatures
 from spt_jax.overlap.triangles.faces_cache import FacesCache
 
 
@@ -17,10 +18,11 @@ def clear_caches() -> None:
 
     What is kept is bounded whatever changes from call to call: the results of the last meshes
     (`config.result_cache_bytes`, 64 MB), what follows from the last lists of faces, tables of the
-    last rest surfaces (50 MB each, at most four), the last 64 compiled calls of `backend="xla"`,
-    and the processes that share batches (100 MB each). This gives all of it back, together with
-    JAX's own compiled programs, as `jax.clear_caches()` does. Everything is made again when it is
-    next asked for: nothing that is returned changes.
+    last rest surfaces (50 MB each, at most four), the last eight meshes of `second_order=True` (10
+    MB each for a body), the last 64 compiled calls of `backend="xla"`, and the processes that share
+    batches (100 MB each). This gives all of it back, together with JAX's own compiled programs, as
+    `jax.clear_caches()` does. Everything is made again when it is next asked for: nothing that is
+    returned changes.
 
     Calls that are under way in other threads are not disturbed.
 
@@ -34,7 +36,7 @@ def clear_caches() -> None:
         if name.partition(".")[0] != __package__:
             continue
         for value in list(vars(module).values()):
-            if isinstance(value, (BoundedJit, FacesCache)):
+            if isinstance(value, (BoundedJit, FacesCache, Curvatures)):
                 value.clear()
             elif hasattr(value, "cache_clear") and hasattr(value, "cache_info"):
                 value.cache_clear()

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 _REFUSAL = (
     "self_intersection_penalty has no forward mode (jax.jvp, jax.jacfwd, and what jax.linearize "
     "returns): its gradient is made for reverse mode; take jax.grad, jax.vjp or jax.jacrev, and in "
-    'optimistix options=dict(jac="bwd").'
+    'optimistix options=dict(jac="bwd"), or pass second_order=True, which has every mode.'
 )
 
 

@@ -53,6 +53,11 @@ class ExactOverlap:
         return all(layer.ends.fits and bool(layer.shares.sound.all()) for layer in self._layers)
 
     @property
+    def layers(self) -> list[Layer]:
+        """The overlaps that count whole, and where something is left out those that are judged."""
+        return self._layers
+
+    @property
     def _whole(self) -> Layer:
         return self._layers[0]
 

@@ -15,6 +15,7 @@ from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.inflation import Inflated
 from spt_jax.overlap.measure import (
     Gradient,
+    Measurement,
     Rule,
     Sampling,
     Unmeasurable,
@@ -59,14 +60,14 @@ def value_on_host(
     vertices: Vertices, faces: Faces, options: PenaltyOptions
 ) -> tuple[Float[np.ndarray, ""], ...]:
     """The penalty alone; NaN where the mesh cannot be measured."""
-    return _measured(vertices, faces, options, with_gradient=False)[:1]
+    return measured(vertices, faces, options, with_gradient=False)[:1]
 
 
 def value_and_gradient_on_host(
     vertices: Vertices, faces: Faces, options: PenaltyOptions
 ) -> tuple[Float[np.ndarray, ""], Float[np.ndarray, "V 3"]]:
     """The penalty and its gradient; NaN and zeros where the mesh cannot be measured."""
-    return _measured(vertices, faces, options, with_gradient=True)
+    return measured(vertices, faces, options, with_gradient=True)[:2]
 
 
 def labels_on_host(
@@ -80,7 +81,10 @@ def labels_on_host(
         return (np.zeros(len(vertices), np.int8),)
 
 
-def _measured(vertices, faces, options: PenaltyOptions, *, with_gradient: bool):
+def measured(
+    vertices: Vertices, faces: Faces, options: PenaltyOptions, *, with_gradient: bool
+) -> tuple[Float[np.ndarray, ""], Float[np.ndarray, "V 3"], Measurement | None]:
+    """Value, gradient, and what was measured; None where there is no overlap, or no measure."""
     nothing = np.zeros_like(vertices)
     moved = None
     try:
@@ -91,10 +95,10 @@ def _measured(vertices, faces, options: PenaltyOptions, *, with_gradient: bool):
             check_usable(vertices, faces, options.rounding)
         exact = options.sampling.rays is None
         if exact and is_small_convex_solid(vertices, faces, options.rounding):
-            return np.zeros(()), nothing
+            return np.zeros(()), nothing, None
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
         if faces.size == 0:
-            return np.zeros(()), nothing
+            return np.zeros(()), nothing, None
         if options.value == "volume":
             value = np.array(found.volume)
         else:
@@ -103,13 +107,13 @@ def _measured(vertices, faces, options: PenaltyOptions, *, with_gradient: bool):
         if moved is not None:
             gradient = moved.pulled_back(gradient)
     except Unmeasurable:
-        return np.array(np.nan), nothing
+        return np.array(np.nan), nothing, None
     # Measured in float64: it may be more than the vertices' dtype can hold, or less.
     narrow = options.rounding > np.finfo(np.float64).eps
     held = np.finfo(np.float32 if narrow else np.float64)
     if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
-        return np.array(np.nan), nothing
+        return np.array(np.nan), nothing, None
     if options.value == "volume" and value < held.tiny:
         # There is no overlap, but for rounding, or none that can be told from none: no slope.
-        return np.zeros(()), nothing
-    return value, gradient
+        return np.zeros(()), nothing, None
+    return value, gradient, found

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
 from spt_jax.overlap.caps import Closed, Hole, closed_surface, holes_of, open_sheets
+from spt_jax.overlap.curvature import Curvature
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.exclusions import NOTHING, Exclusions, Rims, counted_intervals, judged_rims
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
@@ -129,6 +130,11 @@ class Measurement:
         if not self.exclusions.any:
             return self.overlap
         return ExactOverlap(self.surface)
+
+    @cached_property
+    def curvature(self) -> Curvature:
+        """Second derivatives of the volume that counts, where it is exact."""
+        return Curvature(self.overlap)
 
     @property
     def exact(self) -> bool:

@@ -23,7 +23,7 @@ from spt_jax.overlap.triangles.pairs import EdgeCrossings, find_intersections
 from spt_jax.overlap.triangles.predicates import Predicates
 from spt_jax.overlap.triangles.regions import connected_regions
 from spt_jax.overlap.triangles.winding import Ends, enclosing_parts, labels_of, winding_numbers
-from spt_jax.overlap.vectors import dot
+from spt_jax.overlap.vectors import dot, summed
 
 # Vertices that are moved by this many units in the last place of the largest coordinate, as turning
 # a mesh moves them, neither enter a triangle that they touch nor leave it.
@@ -63,6 +63,7 @@ class ExactSurface:
         scale: coordinates are multiplied by this, a power of two.
         points: the new vertices' scaled positions.
         crossings, contours: where the surface meets itself.
+        reach: how near things are that touch, of the scaled positions.
         proper: which of the contours' pairs intersect, and do not only touch.
 
     Raises:
@@ -90,10 +91,10 @@ class ExactSurface:
         self.scale = self.predicates.scale
         self.points = np.ascontiguousarray(self.predicates.points.T)
         self.topology: Topology = prepared(self._faces, len(placed)).topology
-        self._reach = _CONTACT * rounding
+        self.reach = _CONTACT * rounding
         self.crossings: EdgeCrossings
         self.crossings, self._find_contacts = find_intersections(
-            self.points, self._faces, predicates=self.predicates, reach=self._reach
+            self.points, self._faces, predicates=self.predicates, reach=self.reach
         )
         self.contours = find_contours(self.points, self.topology, self.crossings)
 
@@ -127,7 +128,7 @@ class ExactSurface:
     @cached_property
     def proper(self) -> Bool[np.ndarray, "P"]:
         """Pairs of triangles that intersect, and do not only touch."""
-        return self.contours.proper(self.points, self._faces, self._reach)
+        return self.contours.proper(self.points, self._faces, self.reach)
 
     @cached_property
     def pairs(self) -> Int[np.ndarray, "P 2"]:
@@ -144,6 +145,18 @@ class ExactSurface:
         if self.times is not None:
             values[self._copies] = values[self._originals]
         return values
+
+    def carried(self, velocity: Float[np.ndarray, "X 3"]) -> Float[np.ndarray, "X 3"]:
+        """Velocities of the vertices that are measured: of parts in one place, the mean of theirs.
+
+        The transpose of `shared_out`, over how often a part is there.
+        """
+        if self.parts_times is None:
+            return velocity
+        total = self._moving[:, None] * velocity
+        total += summed(self._originals, total[self._copies], len(total))
+        times = np.maximum(self.parts_times, 1)[self.manifold.part]
+        return total / times[:, None]
 
     def shared_out(self, forces: Float[np.ndarray, "X 3"]) -> Float[np.ndarray, "X 3"]:
         """Forces on one of the parts that lie in one place, as those on each of them."""
@@ -239,7 +252,7 @@ class ExactSurface:
         between = replace(shares, share=shares.share - own[:, None])
         volume = volumes_of(self.points, self._faces, between, region, count, self.times)
         area = np.bincount(region, np.sqrt(dot(shares.normals, shares.normals)), count)
-        kept = ~(touching & (np.abs(volume) <= 2 * self._reach * area))
+        kept = ~(touching & (np.abs(volume) <= 2 * self.reach * area))
         segments = layer.segments.copy()
         segments[segments] = kept[at]
         # What copies of one part share with each other stays.

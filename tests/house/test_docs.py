@@ -65,6 +65,12 @@ def the_worst_sample_is_corrected(printed):
     assert 0 < numbers(r"(\d+) of 8 have no collision", printed)[0] < 8
 
 
+def newton_finds_the_balance(printed):
+    steps, slope = re.search(r"(\d+) steps, slope (\S+)", printed).groups()
+    assert 0 < int(steps) < 10 and float(slope) < 1e-4
+    assert numbers(r"differences by ([\d.]+)", printed)[0] < 0.02
+
+
 def energy_is_conserved(printed):
     (accepted,) = numbers(r"(\d+)% accepted", printed)
     (error,) = numbers(r"energy off by ([\d.]+)", printed)
@@ -94,6 +100,7 @@ EXPECTED = {
     "recipes/training-loss.md": the_network_learns_to_collide_less,
     "recipes/generator.md": the_worst_sample_is_corrected,
     "recipes/hmc.md": energy_is_conserved,
+    "recipes/second-order.md": newton_finds_the_balance,
 }
 
 

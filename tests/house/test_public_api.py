@@ -56,7 +56,7 @@ NAMES = [
 PARAMETERS = {
     "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
     " rule='vertex', rays=None, directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
-    " rest_surface=None, backend='auto'",
+    " rest_surface=None, backend='auto', second_order=False",
     "paper_penalty": "vertices, faces, *, rays=512, normalize=True, backend='auto'",
     "classify_vertices": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), rest_surface=None, backend='auto'",
