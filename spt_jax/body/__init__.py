@@ -1,5 +1,6 @@
 """The body model: blend shapes, a kinematic tree and linear blend skinning in JAX."""
 
+from spt_jax.body.adapt import adapt as adapt
 from spt_jax.body.base import AbstractBody as AbstractBody
 from spt_jax.body.base import PosedBody as PosedBody
 from spt_jax.body.files import load_body as load_body

@@ -171,7 +171,7 @@ def untangle_motion(
     count = len(frames.pose)
     before = measured_poses(body, frames, exclusions, depth=True)
     colliding = (before.intersecting_pairs > 0) | (before.volume > tolerance)
-    pose, turns = np.array(frames.pose), np.zeros((count, body.num_joints - 1, 3))
+    pose, turns = np.array(frames.pose), np.zeros((count, body.pose_shape[0] - 1, 3))
     standing = standing_feet(body, frames, rate, _as_up(up), on_ground=translation is not None)
     reach = int(np.ceil(_REACH * smoothness))
     longest = max(int(_LONGEST * smoothness), 4 * reach, _SHORTEST)
@@ -230,9 +230,14 @@ def _as_frames(body: AbstractBody, poses: Any, shape: Any, translation: Any) -> 
             "it sees, so call it outside jit, vmap and grad."
         )
     pose = jnp.asarray(poses)
-    if pose.ndim != 3 or pose.shape[1:] != (body.num_joints, 3) or not len(pose):
+    if len(body.pose_shape) != 2 or body.pose_shape[1] != 3:
         raise ValueError(
-            f"poses must have shape (frames, {body.num_joints}, 3), at least one frame: got "
+            "body must have a pose that is rotations of joints, (J, 3): got one with poses of "
+            f"shape {body.pose_shape}; free its frames one by one with untangle_pose."
+        )
+    if pose.ndim != 3 or pose.shape[1:] != body.pose_shape or not len(pose):
+        raise ValueError(
+            f"poses must have shape (frames, {body.pose_shape[0]}, 3), at least one frame: got "
             f"{pose.shape}; body.pose_from_smpl converts poses of other joint counts."
         )
     shapes = _per_frame("shape", shape, len(pose), body.num_shape if shape is None else None)

@@ -53,7 +53,7 @@ class UntangleResult(Result):
         status: how it ended, one of `spt_jax.RESULTS` for each pose.
     """
 
-    pose: Float[Array, "*batch J 3"]
+    pose: Float[Array, "..."]
     vertices: Float[Array, "*batch V 3"]
     before: Overlap
     after: Overlap
@@ -84,7 +84,7 @@ class UntangleResult(Result):
 
 def untangle_pose(
     body: AbstractBody,
-    pose: Float[Array, "*batch J 3"] | Float[np.ndarray, "*batch J 3"],
+    pose: Float[Array, "..."] | Float[np.ndarray, "..."],
     *,
     shape: Float[Array, "*#batch B"] | Float[np.ndarray, "*#batch B"] | None = None,
     translation: Float[Array, "*#batch 3"] | Float[np.ndarray, "*#batch 3"] | None = None,
