@@ -74,6 +74,11 @@ class AdaptedBody(AbstractBody):
         return (sum(size for _, size in self._sizes("pose")),)
 
     @property
+    def pose_is_rotations(self) -> bool:
+        """Whether the model's pose is rotations."""
+        return self.rows is not None
+
+    @property
     def free_rows(self) -> Int[np.ndarray, "R"]:
         """Rows of a pose that untangling moves: all but the one that turns the whole."""
         return np.arange(1 if self.rows is not None else 0, self.pose_shape[0])

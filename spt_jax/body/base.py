@@ -66,6 +66,11 @@ class AbstractBody(eqx.Module):
         return (self.num_joints, 3)
 
     @property
+    def pose_is_rotations(self) -> bool:
+        """Whether each row of a pose is the axis-angle of a joint, row 0 of the root."""
+        return True
+
+    @property
     def free_rows(self) -> Int[np.ndarray, "R"]:
         """Rows of a pose that untangling moves: all joints but the root."""
         return np.arange(1, self.num_joints)

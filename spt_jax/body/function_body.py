@@ -51,6 +51,11 @@ class FunctionBody(AbstractBody):
         return tuple(self.rest.shape)
 
     @property
+    def pose_is_rotations(self) -> bool:
+        """False: what a pose means is the function's."""
+        return False
+
+    @property
     def free_rows(self) -> Int[np.ndarray, "R"]:
         """All rows of a pose."""
         return np.arange(self.pose_shape[0])

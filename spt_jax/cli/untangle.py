@@ -22,6 +22,7 @@ def untangle(
     fold_distance: float | None = None,
     meshes: bool = False,
     like_input: bool = False,
+    together: bool = False,
     rays: int | None = None,
     anew: bool = False,
     max_bytes: int | None = None,
@@ -60,6 +61,8 @@ def untangle(
             0.04 on fingers.
         meshes: write a .glb of each frame before and after, coloured by label.
         like_input: write NAME_untangled too, the input in its own structure with the new poses.
+        together: the people of a file as one scene a frame: freed of themselves and of each other,
+            which also moves them as a whole; what is between and within them is counted apart.
         rays: how many rays to cast along the longer side of each of three beams; the search uses
             half as many; not given: none, everything is measured exactly.
         anew: throw away what is done of an unfinished run in the folder.
@@ -74,7 +77,7 @@ def untangle(
         rigged = is_rig_file(poses, max_bytes=max_bytes)
     if rigged:
         with user_errors():
-            _refuse("a rig", like_input=like_input, body=body != "anny")
+            _refuse("a rig", like_input=like_input, together=together, body=body != "anny")
         return untangle_rig_file(
             poses,
             out,
@@ -99,6 +102,7 @@ def untangle(
                 frames=frames != "all",
                 people=people != "all",
                 like_input=like_input,
+                together=together,
                 body=body != "anny",
                 folds=folds != "ignore",
                 fold_distance=fold_distance is not None,
@@ -110,13 +114,31 @@ def untangle(
     from spt_jax._exclusions import as_fold_distance
     from spt_jax._query import as_rays
     from spt_jax.cli.motions import chosen, motion_of, write_like_input, write_motions
+    from spt_jax.cli.together import untangle_together
     from spt_jax.files.outputs import ensure_folder, write_json
 
     with user_errors():
         as_rays(rays)
         as_fold_distance(fold_distance)
         asked = chosen(poses, people, frames, max_bytes)
+        if together and like_input:
+            raise ValueError(
+                "like_input writes rotations alone: got it with together, which moves people, too; "
+                "leave one of them out."
+            )
         folder = ensure_folder(out)
+    if together:
+        return untangle_together(
+            asked,
+            body,
+            folder,
+            {"rays": rays, "directions": 3, "folds": folds, "fold_distance": fold_distance},
+            meshes=meshes,
+            anew=anew,
+            max_bytes=max_bytes,
+            json=json,
+            quiet=quiet,
+        )
     with progress_bar(len(asked.rows), quiet) as state:
         state("loading the body")
         from spt_jax.body import load_body

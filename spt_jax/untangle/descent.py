@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from spt_jax._penalty import self_intersection_penalty
 from spt_jax._status import RESULTS
 from spt_jax._steps import OnStep, Step
-from spt_jax.body import AbstractBody
+from spt_jax.body import AbstractBody, BodyGroup
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
@@ -103,13 +103,22 @@ def faces_of(body: AbstractBody) -> Int[np.ndarray, "F 3"]:
 
 @eqx.filter_jit
 def displacement_factor(body, pose, shape):
-    """Cholesky factor of the quadratic form: joint rotations -> mean squared displacement."""
+    """Cholesky factor of the quadratic form: free rows -> mean squared displacement."""
+    if isinstance(body, BodyGroup) and body.count > 1:
+        # What moves one person moves no other: a block for each.
+        forms = [_displacement_form(*one) / body.count for one in body.alone(pose, shape)]
+        form = jax.scipy.linalg.block_diag(*forms)
+    else:
+        form = _displacement_form(body, pose, shape)
+    return jnp.linalg.cholesky(form + STIFFNESS * jnp.eye(len(form), dtype=form.dtype))
+
+
+def _displacement_form(body, pose, shape):
     free = body.free_rows
     given = pose[free]
     jacobian = jax.jacfwd(lambda rows: body(pose.at[free].set(rows), shape).vertices)(given)
     jacobian = jacobian.reshape(-1, given.size)
-    form = jacobian.T @ jacobian / body.num_vertices
-    return jnp.linalg.cholesky(form + STIFFNESS * jnp.eye(len(form), dtype=form.dtype))
+    return jacobian.T @ jacobian / body.num_vertices
 
 
 def turned(body, pose, factor, moved):

@@ -230,7 +230,7 @@ def _as_frames(body: AbstractBody, poses: Any, shape: Any, translation: Any) -> 
             "it sees, so call it outside jit, vmap and grad."
         )
     pose = jnp.asarray(poses)
-    if len(body.pose_shape) != 2 or body.pose_shape[1] != 3:
+    if not body.pose_is_rotations:
         raise ValueError(
             "body must have a pose that is rotations of joints, (J, 3): got one with poses of "
             f"shape {body.pose_shape}; free its frames one by one with untangle_pose."
