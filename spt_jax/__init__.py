@@ -14,6 +14,7 @@ if typing.TYPE_CHECKING:
     from spt_jax import xla as xla
     from spt_jax._caches import clear_caches as clear_caches
     from spt_jax._camera import PinholeCamera as PinholeCamera
+    from spt_jax._contact import contact_penalty as contact_penalty
     from spt_jax._geometry import inflate as inflate
     from spt_jax._groups import Scene as Scene
     from spt_jax._groups import between_groups as between_groups
@@ -87,6 +88,7 @@ __all__ = [
     "classify_vertices",
     "clear_caches",
     "config",
+    "contact_penalty",
     "fit_people",
     "fit_pose",
     "inflate",
@@ -118,6 +120,7 @@ __getattr__, __dir__ = _lazy_names(
         "load_mocap": "spt_jax.body",
         "clear_caches": "spt_jax._caches",
         "PinholeCamera": "spt_jax._camera",
+        "contact_penalty": "spt_jax._contact",
         "inflate": "spt_jax._geometry",
         "Scene": "spt_jax._groups",
         "between_groups": "spt_jax._groups",

@@ -35,6 +35,7 @@ NAMES = [
     "classify_vertices",
     "clear_caches",
     "config",
+    "contact_penalty",
     "fit_people",
     "fit_pose",
     "inflate",
@@ -57,6 +58,7 @@ PARAMETERS = {
     "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
     " rule='vertex', rays=None, directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
     " rest_surface=None, backend='auto', second_order=False",
+    "contact_penalty": "vertices, faces, pairs, *, margin=0.0",
     "paper_penalty": "vertices, faces, *, rays=512, normalize=True, backend='auto'",
     "classify_vertices": "vertices, faces, *, rays=None, directions=3, rule='vertex',"
     " face_groups=None, ignore_groups=(), rest_surface=None, backend='auto'",
