@@ -1,16 +1,16 @@
-"""Whether this machine draws off screen: pictures of meshes are tested only where it does."""
+"""Whether pictures can be drawn, and whether the system draws them or `show/software.py`."""
 
 import pytest
 
-from spt_jax.show.offscreen import RenderingUnavailable, offscreen_window
+from spt_jax.show.offscreen import SOFTWARE, offscreen_window
 
 
-def _draws() -> bool:
+def _window() -> str | None:
     try:
-        offscreen_window()
-    except (ImportError, RenderingUnavailable):
-        return False
-    return True
+        return offscreen_window()
+    except ImportError:
+        return "missing"
 
 
-needs_drawing = pytest.mark.skipif(not _draws(), reason="nothing can draw off screen here")
+needs_drawing = pytest.mark.skipif(_window() == "missing", reason="pyvista is not installed")
+needs_opengl = pytest.mark.skipif(_window() in ("missing", SOFTWARE), reason="no OpenGL here")

@@ -108,7 +108,7 @@ def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
 def _draw(path: Path, frames: list["Frame"], faces: Any) -> str | None:
     """Draw the picture, or say why there is none."""
     from spt_jax.files.outputs import atomic_write
-    from spt_jax.show import RenderingUnavailable, render_strip
+    from spt_jax.show import render_strip
 
     # Two blocks of rows side by side: one above the other is too tall for a page or a screen.
     half = (len(frames) + 1) // 2
@@ -126,7 +126,7 @@ def _draw(path: Path, frames: list["Frame"], faces: Any) -> str | None:
             for block in blocks
         ]
         from PIL import Image
-    except (ImportError, RenderingUnavailable) as error:
+    except ImportError as error:
         return " ".join(str(error).split())
     height, width, _ = pictures[0].shape
     page = np.full((height, len(pictures) * (width + _GUTTER) - _GUTTER, 3), 255, np.uint8)

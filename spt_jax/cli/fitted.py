@@ -258,7 +258,7 @@ def write_bodies(
 
 def draw(folder: Path, people: Sequence[Fitted], faces: Any) -> tuple[list[str], str | None]:
     """Draw the bodies of each image over it; the pictures' names, or why there are none."""
-    from spt_jax.show import RenderingUnavailable, render_overlay
+    from spt_jax.show import render_overlay
 
     names = []
     for image in dict.fromkeys(one.given.image for one in people):
@@ -282,7 +282,7 @@ def draw(folder: Path, people: Sequence[Fitted], faces: Any) -> tuple[list[str],
                 skeleton=[one.given.person.layout for one in there],
                 path=folder / f"{image}.png",
             )
-        except (ImportError, RenderingUnavailable) as error:
+        except ImportError as error:
             return names, " ".join(str(error).split())
         names.append(f"{image}.png")
     return names, None

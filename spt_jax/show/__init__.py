@@ -2,7 +2,6 @@
 
 from spt_jax.show.arrows import render_arrows as render_arrows
 from spt_jax.show.curves import plot_curves as plot_curves
-from spt_jax.show.offscreen import RenderingUnavailable as RenderingUnavailable
 from spt_jax.show.overlay import render_overlay as render_overlay
 from spt_jax.show.pictures import render_before_after as render_before_after
 from spt_jax.show.pictures import render_mesh as render_mesh

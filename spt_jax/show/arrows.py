@@ -51,7 +51,6 @@ def render_arrows(
 
     Raises:
         ImportError: the `viz` extra is not installed.
-        RenderingUnavailable: this machine cannot draw off screen.
         ValueError: arrays that do not make a mesh, vectors of another shape or not finite, most
             under 1, an unknown view, a size too small, or a path not ending in .png.
         OSError: the file's folder is missing or cannot be written.

@@ -1,4 +1,4 @@
-"""A pyvista plotter that draws without a display, or a clear error where nothing can."""
+"""A plotter that draws without a display: pyvista's, or our own where no OpenGL can be had."""
 
 import ctypes
 import functools
@@ -11,11 +11,9 @@ from typing import Any
 
 _WINDOW_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 _EGL = "vtkEGLRenderWindow"
+#: In place of a window: `software.py` draws.
+SOFTWARE = "software"
 _OSMESA_NAMES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
-
-
-class RenderingUnavailable(RuntimeError):
-    """This machine offers no way to draw off screen: neither EGL, nor OSMesa, nor a display."""
 
 
 def import_extra(name: str) -> ModuleType:
@@ -36,13 +34,20 @@ def import_extra(name: str) -> ModuleType:
 def offscreen_plotter(width: int, height: int) -> Iterator[Any]:
     """Yield an empty, unlit `pyvista.Plotter` of so many pixels, closed afterwards.
 
+    Or a `SoftwarePlotter`, which takes the same calls, where the system draws nothing.
+
     Raises:
         ImportError: pyvista is not installed.
-        RenderingUnavailable: no off-screen window can be made here.
     """
     pyvista = import_extra("pyvista")
-    with _window(offscreen_window()), _quiet_vtk():
-        plotter = pyvista.Plotter(off_screen=True, window_size=(width, height), lighting="none")
+    window = offscreen_window()
+    if window == SOFTWARE:
+        from spt_jax.show.software import SoftwarePlotter
+
+        plotter: Any = SoftwarePlotter(width, height)
+    else:
+        with _window(window), _quiet_vtk():
+            plotter = pyvista.Plotter(off_screen=True, window_size=(width, height), lighting="none")
     try:
         yield plotter
     finally:
@@ -55,10 +60,8 @@ def offscreen_window() -> str | None:
 
     VTK 9.7 falls back from one class to the next by itself, but ends at OSMesa without asking
     whether its library is there, and the first drawing then ends the process with a segmentation
-    fault. So each class is made once here, undrawn, to see what VTK turns it into.
-
-    Raises:
-        RenderingUnavailable: none can.
+    fault. So each class is made once here, undrawn, to see what VTK turns it into. `SOFTWARE` where
+    none can.
     """
     if sys.platform != "linux":
         return None
@@ -77,10 +80,7 @@ def offscreen_window() -> str | None:
             return made
     if any(_loads(name) for name in _OSMESA_NAMES):
         return "vtkOSOpenGLRenderWindow"
-    raise RenderingUnavailable(
-        "off-screen pictures need EGL or OSMesa: got neither, and no display; "
-        "install one, for instance: apt-get install libegl1 libgl1-mesa-dri"
-    )
+    return SOFTWARE
 
 
 @contextmanager

@@ -66,7 +66,6 @@ def render_overlay(
 
     Raises:
         ImportError: the `viz` extra is not installed.
-        RenderingUnavailable: this machine cannot draw off screen.
         TypeError, ValueError: an argument of another kind or shape than these, an image file that
             is none, a path not ending in .png.
         OSError: the image is missing, or the file's folder is missing or cannot be written.

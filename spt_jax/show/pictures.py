@@ -51,7 +51,6 @@ def render_mesh(
 
     Raises:
         ImportError: the `viz` extra is not installed.
-        RenderingUnavailable: this machine cannot draw off screen.
         ValueError: arrays that do not make a mesh, an unknown view, or a path not ending in .png.
         OSError: the file's folder is missing or cannot be written.
 
@@ -92,7 +91,7 @@ def render_before_after(
         path: as in `render_mesh`.
 
     Raises:
-        ImportError, RenderingUnavailable, ValueError, OSError: as `render_mesh` does, and
+        ImportError, ValueError, OSError: as `render_mesh` does, and
             ValueError for lists of different lengths.
 
     Example:
@@ -144,7 +143,7 @@ def render_strip(
         path: as in `render_mesh`.
 
     Raises:
-        ImportError, RenderingUnavailable, ValueError, OSError: as `render_mesh` does, and
+        ImportError, ValueError, OSError: as `render_mesh` does, and
             ValueError where meshes, labels and titles do not match.
 
     Example:

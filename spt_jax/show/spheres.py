@@ -49,7 +49,6 @@ def render_spheres(
 
     Raises:
         ImportError: the `viz` extra is not installed.
-        RenderingUnavailable: this machine cannot draw off screen.
         TypeError, ValueError: pose or shape as the body raises them; an unknown view, a size below
             16 pixels, or a path not ending in .png.
         OSError: the file's folder is missing or cannot be written.
