@@ -11,8 +11,10 @@ from helpers import body_faces, embedded_body, join, mocap, random_rotation, sph
 
 from spt_jax import clear_caches
 from spt_jax.overlap.measure import Sampling, measure
-from spt_jax.overlap.triangles import pair_boxes, pair_layout, warm_pairs
-from spt_jax.overlap.triangles.pair_layout import prepared
+from spt_jax.overlap.triangles import near_triangles, pair_boxes, pair_layout, warm_pairs
+from spt_jax.overlap.triangles.gaps import gaps
+from spt_jax.overlap.triangles.pair_layout import CLUSTER, prepared
+from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
 from spt_jax.overlap.triangles.predicates import Predicates
 
 EXACT = Sampling(None, ((1.0, 0.0, 0.0),))
@@ -102,49 +104,101 @@ def test_threads_change_nothing(shapes):
         assert list(pool.map(all_of_them, range(4))) == [[]] * 4
 
 
-def pairs_of(mesh, vertices, kept):
-    """The pairs, with what is kept or anew; and what is kept afterwards."""
-    faces = mesh.topology.faces
-    predicates = Predicates(vertices, faces)
-    points = predicates.points
-    layout, *rest = pair_boxes.near_groups(mesh, points)
-    mesh.kept = kept
-    parts = list(warm_pairs.warm_pairs(mesh, points, predicates.scale, layout, *rest))
-    t, u = pair_boxes.concatenate(parts)
-    return {frozenset(pair) for pair in np.stack([t, u], axis=1).tolist()}, mesh.kept
+def unseen(mesh, vertices):
+    """What is left to look at of a shape, and the crossings of a first call that it leaves out."""
+    faces, left = mesh.topology.faces, None
+    signs = Predicates(vertices, faces)
+    left = warm_pairs.left_of(mesh, signs.points, signs.scale)
+    if left is None:
+        return None, 0
+    slot = left.layout.slot
+    with pytest.MonkeyPatch.context() as changed:
+        changed.setattr(near_triangles, "left_of", lambda *_: None)
+        changed.setattr(near_triangles, "keep", lambda *_: None)
+        pairs = face_pairs(edge_crossings(vertices, faces))
+    looked_at = {frozenset(pair) for pair in left.pairs.T.tolist()}
+    groups = {frozenset(pair) for pair in left.groups.T.tolist()}
+    missing = 0
+    for f, g in pairs.tolist():
+        shared = np.intersect1d(faces[f], faces[g])
+        ends = slot[f], slot[g]
+        if len(shared):
+            missing += not np.isin(shared, left.vertex).any()
+        elif frozenset(x // CLUSTER**2 for x in ends) not in groups:
+            missing += frozenset(ends) not in looked_at
+    return left, missing
 
 
 @pytest.mark.parametrize("steps", BODIES)
-def test_kept_pairs_lose_none_and_add_none(steps):
+def test_what_crosses_is_always_looked_at(steps):
     meshes, faces = steps(np.random.default_rng(5), 6)
+    pair_layout._meshes.clear()
     mesh = prepared(faces, len(meshes[0]))
-    kept, used = None, 0
+    used = 0
     for vertices in meshes:
-        anew, _ = pairs_of(mesh, vertices, None)
-        known, after = pairs_of(mesh, vertices, kept)
-        assert known == anew and len(anew) > 0
-        used += kept is not None and kept.pairs is not None and after is kept
-        kept = after
+        left, missing = unseen(mesh, vertices)
+        assert missing == 0
+        used += left is not None
+        results(vertices, faces)
     assert used >= 2  # else nothing was tried
 
 
-def test_few_groups_are_searched_where_the_body_moved_a_millimetre(monkeypatch):
-    meshes, faces = body_steps(np.random.default_rng(2), 2)
+def test_little_is_looked_at_where_the_body_moved_a_millimetre():
+    meshes, faces = body_steps(np.random.default_rng(2), 3)
+    pair_layout._meshes.clear()
     mesh = prepared(faces, len(meshes[0]))
-    _, kept = pairs_of(mesh, meshes[0], None)
-    assert kept.pairs is None  # of a first mesh only its points
-    _, kept = pairs_of(mesh, meshes[0], kept)
-    searched, all_of_them = [], warm_pairs.across_groups
+    results(meshes[0], faces)
+    assert mesh.kept.apart is None  # of a first mesh only its points
+    results(meshes[1], faces)
+    kept = mesh.kept
+    left, _ = unseen(mesh, meshes[2])
+    assert left.pairs.shape[1] < 0.05 * kept.apart.pairs.shape[1]
+    assert len(left.vertex) < 0.05 * len(meshes[2])
+    assert left.groups.shape[1] < 0.05 * kept.apart.groups.shape[1]
+    assert mesh.kept is kept and mesh.used == 1
+    assert unseen(mesh, meshes[3])[0] is None  # another frame
+    assert mesh.kept is None
 
-    def counted(layout, shape, clusters, groups, marked=None):
-        searched.append(sum(len(a) for a, _ in groups))
-        return all_of_them(layout, shape, clusters, groups, marked)
 
-    monkeypatch.setattr(warm_pairs, "across_groups", counted)
-    pairs_of(mesh, meshes[1], kept)
-    assert mesh.kept is kept and searched[0] < warm_pairs._FEW * mesh.usual_pairs
-    pairs_of(mesh, meshes[2], kept)  # another frame
-    assert mesh.kept is not kept and searched[1] >= mesh.usual_pairs // 2
+def test_what_was_of_no_use_is_kept_later():
+    """Frames that come in twos would pay for a list each, and use none."""
+    vertices, faces = sphere(subdivisions=3)
+    faces = np.asarray(faces, np.int64)
+    pair_layout._meshes.clear()
+    mesh = prepared(faces, len(vertices))
+    made = []
+    for k in range(40):
+        results(vertices * (1 + 0.3 * (k % 4 > 1)), faces)
+        made.append(mesh.kept is not None and mesh.kept.apart is not None)
+    assert 0 < sum(made) <= 4
+    for _ in range(warm_pairs._MOST_PATIENCE + 3):
+        results(vertices, faces)
+    assert mesh.kept.apart is not None and mesh.used
+    results(2.0 * vertices, faces)
+    assert mesh.patience == 0
+
+
+def test_gaps_are_lower_bounds_and_told_of_all_that_are_apart(rng):
+    corners = rng.uniform(-1, 1, (400, 3, 3)) * rng.choice([0.05, 0.3, 1.0], (400, 1, 1))
+    corners[::7, :, 2] = 0.25  # in one plane
+    vertices, faces = corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3)
+    mesh = pair_layout.Prepared(prepared(faces, len(vertices)).topology)
+    layout, shape, *_ = pair_boxes.near_groups(mesh, vertices.T.copy())
+    f, g = rng.integers(0, 400, (2, 3000))
+    f, g = f[f != g], g[f != g]
+    found = gaps(shape, layout.slot[f], layout.slot[g], np.inf)
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 9)] * 2), -1).reshape(-1, 2)
+    grid = grid[grid.sum(axis=1) <= 1]
+    weights = np.column_stack([1 - grid.sum(axis=1), grid])
+    for pair in range(0, len(f), 20):
+        one, other = (weights @ corners[x[pair]] for x in (f, g))
+        nearest = np.linalg.norm(one[:, None] - other, axis=2).min()
+        assert found[pair] <= nearest
+    crossing = {tuple(x) for x in face_pairs(edge_crossings(vertices, faces)).tolist()}
+    meets = np.array([(min(x), max(x)) in crossing for x in zip(f, g, strict=True)])
+    flat = (f % 7 == 0) & (g % 7 == 0)  # where they touch, ties decide
+    np.testing.assert_array_equal(found[~flat] <= 0, meets[~flat])
+    assert (found[flat] > 0).any() and not meets[found > 0].any()
 
 
 def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
@@ -153,8 +207,10 @@ def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
     for _ in range(2):
         results(vertices, faces)
     kept = prepared(faces, len(vertices)).kept
-    size = kept.points.nbytes + kept.pairs.nbytes
-    assert 0 < size < 200 * len(faces)
+    assert kept.apart is not None
+    known = (*vars(kept).values(), *vars(kept.apart).values())
+    assert 0 < sum(x.nbytes for x in known if isinstance(x, np.ndarray)) < 400 * len(faces)
+    del known
     gone = weakref.ref(kept)
     del kept
     clear_caches()
@@ -169,4 +225,4 @@ def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
             for _ in range(3):
                 assert results(vertices, faces) == expected
             kept = prepared(faces, len(vertices)).kept
-            assert kept is None or kept.pairs is None
+            assert kept is None or kept.apart is None

@@ -18,20 +18,26 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
+from spt_jax.overlap.triangles.fans import around_vertices, facing
 from spt_jax.overlap.triangles.pair_boxes import (
     STEPS,
+    Boxes,
+    Pairs,
+    Shape,
     across_groups,
+    boxes_of,
     near_groups,
     near_pairs,
     parts_of_size,
+    pieces,
     ranked,
     touching_share,
     within_clusters,
 )
-from spt_jax.overlap.triangles.pair_layout import Prepared
+from spt_jax.overlap.triangles.pair_layout import Layout, Prepared
 from spt_jax.overlap.triangles.pair_planes import not_apart
 from spt_jax.overlap.triangles.predicates import Predicates
-from spt_jax.overlap.triangles.warm_pairs import warm_pairs
+from spt_jax.overlap.triangles.warm_pairs import Left, keep, left_of
 
 # Upper bound on face pairs that the plane of neither face separates. A mesh with more is noise, and
 # the list would exhaust memory: a body of 24,540 triangles has 1,800, with joints turned by 2 rad
@@ -41,8 +47,6 @@ _MOST_PAIRS, _MOST_PAIRS_EACH = 2_000_000, 20
 # Of so many pairs at least, this part has to touch for ranks to be worth three sorts.
 _MANY, _TOUCHING = 1024, 0.1
 
-Pairs = list[tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]]
-
 
 class Entangled(ValueError):
     """A mesh is so crumpled that its triangles' pairs cannot be listed."""
@@ -51,11 +55,8 @@ class Entangled(ValueError):
 class NearTriangles:
     """Pairs of triangles near each other, of one shape of a mesh.
 
-    Attributes:
-        layout, shape: the triangles in their slots.
-
     Args:
-        mesh: what is known of the faces.
+        mesh: what is known of the faces, and of the last shapes.
         predicates: the signs.
         reach: how near to a triangle a vertex lies on it.
         touching: only pairs with one of these faces are wanted; all if not given.
@@ -69,9 +70,32 @@ class NearTriangles:
         touching: Bool[np.ndarray, "F"] | None = None,
     ):
         self._mesh, self._predicates, self._reach = mesh, predicates, reach
-        self.layout, self.shape, self._clusters, self._groups = near_groups(mesh, predicates.points)
         self._touching = touching
         self._near: list[Int[np.ndarray, "2 _"]] | None = None
+        self._left = None
+        if touching is None:
+            self._left = left_of(mesh, predicates.points, predicates.scale)
+            if self._left is None:
+                self._left = keep(mesh, predicates.points, predicates.scale, self._boxes[:3])
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The triangles in their slots."""
+        return self._boxes[0] if self._left is None else self._left.layout
+
+    @cached_property
+    def _boxes(self) -> tuple[Layout, Shape, Boxes, Pairs]:
+        """The layout, triangles and clusters in it, and the pairs of groups that meet."""
+        return near_groups(self._mesh, self._predicates.points)
+
+    def around_vertices(self):
+        """Candidates (row, slot) whose triangles share the one vertex that is not on the edge."""
+        topology = self._mesh.topology
+        if self._left is not None:
+            vertex = self._left.vertex
+        else:
+            vertex = np.flatnonzero(~facing(topology, *self._boxes[:2])[0])
+        return around_vertices(self._predicates.points, topology, self.layout, vertex)
 
     def straddling(self) -> Pairs:
         """Slots of the pairs each of which has corners on both sides of the other's plane.
@@ -79,29 +103,49 @@ class NearTriangles:
         Raises:
             Entangled: they are too many to be listed.
         """
-        found, self._near = self._found(self._by_place(), self._predicates.points.shape[1] < STEPS)
-        return self._found(self._by_rank(), False)[0] if self._near is None else found
+        if self._left is not None:
+            return self._still(self._left)
+        few = self._predicates.points.shape[1] < STEPS
+        found, self._near = self._found(self._by_place(), few)
+        if self._near is None:
+            return self._found(self._by_rank(), False)[0]
+        return found
+
+    def _still(self, left: Left) -> Pairs:
+        """The same of what an earlier shape left to look at."""
+        found = [self._straddling(*left.pairs[:, part]) for part in pieces(left.pairs.shape[1], 1)]
+        a, b = left.groups
+        if len(a):
+            layout = left.layout
+            shape, clusters = boxes_of(self._predicates.points, layout)[:2]
+            within = within_clusters(layout, shape, a[a == b])
+            across = across_groups(layout, shape, clusters, [(a, b)])
+            for t, u in parts_of_size(chain(within, across)):
+                t, u, _ = not_apart(left.layout, shape, t, u, 0.0)
+                found.append(self._straddling(t, u))
+        return found
 
     @cached_property
     def contacts(self) -> Contacts:
         """The corners of triangles that lie on others."""
-        near = self._near
+        near, (layout, shape) = self._near, self._boxes[:2]
         if near is None:
-            # Ranks told apart what touches.
+            # They were told apart by rank, or were known to be.
             near = (self._not_apart(t, u)[2] for t, u in self._by_place())
-        return contacts_of(self.layout, self.shape, near, self._reach)
+        return contacts_of(layout, shape, near, self._reach)
 
     def _by_place(self):
         """Pairs whose boxes meet."""
-        parts = self.layout, self.shape, self._clusters, self._groups
+        layout, shape, clusters, groups = self._boxes
         if self._touching is not None:
-            return near_pairs(*parts, self._touching)
-        return warm_pairs(self._mesh, self._predicates.points, self._predicates.scale, *parts)
+            return near_pairs(layout, shape, clusters, groups, self._touching)
+        across = across_groups(layout, shape, clusters, groups)
+        return parts_of_size(chain(within_clusters(layout, shape), across))
 
     def _by_rank(self):
         """Pairs whose boxes meet once vertices are moved along their pushes."""
-        layout = self.layout
-        shape, clusters, groups = ranked(self.shape, layout, self._predicates.ranks)
+        layout = self._boxes[0]
+        shape, clusters, groups = ranked(self._boxes[1], layout, self._predicates.ranks)
         if self._touching is not None:
             return near_pairs(layout, shape, clusters, groups, self._touching)
         across = across_groups(layout, shape, clusters, groups)
@@ -110,9 +154,10 @@ class NearTriangles:
     def _found(self, pairs, if_few_touch: bool):
         """The straddling ones, and those with a corner in the other's plane; None if given up."""
         found, near, seen = [], [], 0
-        most = _MOST_PAIRS + _MOST_PAIRS_EACH * len(self.layout.slot)
+        layout, shape = self._boxes[:2]
+        most = _MOST_PAIRS + _MOST_PAIRS_EACH * len(layout.slot)
         for t, u in pairs:
-            if if_few_touch and len(t) >= _MANY and touching_share(self.shape, t, u) > _TOUCHING:
+            if if_few_touch and len(t) >= _MANY and touching_share(shape, t, u) > _TOUCHING:
                 return found, None
             t, u, in_plane = self._not_apart(t, u)
             near.append(in_plane)
@@ -120,14 +165,14 @@ class NearTriangles:
             if seen > most:
                 raise Entangled(
                     "vertices must be a surface whose triangles mostly lie apart: got more than "
-                    f"{most:,} pairs of {len(self.layout.slot):,} triangles that are near each "
-                    "other; look for coordinates that exploded or collapsed."
+                    f"{most:,} pairs of {len(layout.slot):,} triangles that are near each other; "
+                    "look for coordinates that exploded or collapsed."
                 )
             found.append(self._straddling(t, u))
         return found, near
 
     def _not_apart(self, t, u):
-        return not_apart(self.layout, self.shape, t, u, self._reach)
+        return not_apart(*self._boxes[:2], t, u, self._reach)
 
     def _straddling(self, t, u):
         corners, count = self.layout.corners, self._predicates.points.shape[1]

@@ -126,6 +126,13 @@ def _shape(points, layout: Layout) -> Shape:
     return Shape(corner, normal, length, extent, low, high, *words, span)
 
 
+def boxes_of(points, layout: Layout) -> tuple[Shape, Boxes, Boxes]:
+    """The triangles in a layout, their clusters and the groups of these."""
+    shape = _shape(points, layout)
+    groups = joined(*around(*around(shape.low, shape.high)))
+    return shape, joined(*around(shape.low, shape.high), groups), groups
+
+
 def near_groups(mesh: Prepared, points):
     """A layout, the triangles and clusters in it, and the pairs of groups that meet."""
     layout = mesh.layout
@@ -133,9 +140,7 @@ def near_groups(mesh: Prepared, points):
     while True:
         if layout is None:
             layout = mesh.arrange(_face_boxes(points, mesh.topology.faces))
-        shape = _shape(points, layout)
-        groups = joined(*around(*around(shape.low, shape.high)))
-        clusters = joined(*around(shape.low, shape.high), groups)
+        shape, clusters, groups = boxes_of(points, layout)
         # Clusters that were compact once may be strewn all over another shape.
         limit = 2 * mesh.usual_pairs + len(groups.low_word)
         pairs, count = [], 0
@@ -173,9 +178,11 @@ def touching_share(shape: Shape, t, u) -> float:
         t, u: their slots; some are looked at.
     """
     step = max(len(t) // _SAMPLE, 1)
-    boxes = [shape.corner.take(x[::step], axis=2) for x in (t, u)]
-    (low, high), (other_low, other_high) = ((x.min(axis=1), x.max(axis=1)) for x in boxes)
-    return float(((high == other_low) | (other_high == low)).any(axis=0).mean())
+    some, others = t[::step], u[::step]
+    # The high ends are one step above where they are.
+    over = shape.high.take(some, axis=1) - shape.low.take(others, axis=1)
+    under = shape.high.take(others, axis=1) - shape.low.take(some, axis=1)
+    return float((np.minimum(over, under).min(axis=0) == 1).mean())
 
 
 def near_pairs(layout: Layout, shape: Shape, clusters: Boxes, groups: Pairs, touching):
@@ -210,10 +217,15 @@ def parts_of_size(found: Iterable[tuple[np.ndarray, np.ndarray]]):
         yield concatenate(waiting)
 
 
-def within_clusters(layout: Layout, shape: Shape):
-    """Such pairs of one cluster."""
-    for part in pieces(layout.apart.shape[1], 1):
-        yield kept_meeting(shape, *layout.apart[:, part])
+def within_clusters(layout: Layout, shape: Shape, groups: Int[np.ndarray, "G"] | None = None):
+    """Such pairs of one cluster, of some groups of clusters if not of all."""
+    pairs = layout.apart
+    if groups is not None:
+        marked = np.zeros(len(layout.face) // CLUSTER**2, bool)
+        marked[groups] = True
+        pairs = pairs[:, marked[pairs[0] // CLUSTER**2]]
+    for part in pieces(pairs.shape[1], 1):
+        yield kept_meeting(shape, *pairs[:, part])
 
 
 def across_groups(layout: Layout, shape: Shape, clusters: Boxes, groups: Pairs, marked=None):

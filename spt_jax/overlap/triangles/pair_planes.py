@@ -59,12 +59,6 @@ def _apart_in_plane(layout: Layout, shape: Shape, x, y, reach: float):
     return apart
 
 
-def straddles(shape: Shape, points, extent, slot):
-    """Whether points (3, N, M) lie on both sides of the planes of M triangles, or may."""
-    height, margin = heights(shape, points, extent, slot)
-    return (height.min(axis=0) <= margin) & (height.max(axis=0) >= -margin)
-
-
 def heights(shape: Shape, points, extent, slot):
     """Heights of points (3, N, M) above the planes of M triangles, and what rounding may add."""
     normal, corner = shape.normal.take(slot, axis=1), shape.corner[:, 0].take(slot, axis=1)

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
-from spt_jax.overlap.ranges import spread, unique
+from spt_jax.overlap.ranges import unique
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.near_triangles import NearTriangles
-from spt_jax.overlap.triangles.pair_boxes import Shape, concatenate, parts
+from spt_jax.overlap.triangles.pair_boxes import concatenate
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
-from spt_jax.overlap.triangles.pair_planes import ROUNDING, straddles
 from spt_jax.overlap.triangles.predicates import Predicates
 
 
@@ -129,7 +128,7 @@ def find_intersections(
     touching = None if among is None else _touching(topology, among)
     near = NearTriangles(mesh, predicates, reach, touching)
     layout = near.layout
-    found = list(_around_vertices(points, topology, layout, near.shape))
+    found = list(near.around_vertices())
     found += [_edges_of_pairs(topology, layout, t, u) for t, u in near.straddling()]
     row, slot = concatenate(found) if found else (nothing, nothing)
     if among is not None:
@@ -188,75 +187,6 @@ def _touching(topology: Topology, among):
     for side in topology.edge_faces.T:
         touching[side[marked & (side >= 0)]] = True
     return touching
-
-
-def _around_vertices(points, topology: Topology, layout: Layout, shape: Shape):
-    """Candidates (row, slot) whose triangles share the one vertex that is not on the edge."""
-    vertex = _uncertain(points, topology, layout, shape)
-    corner, at = spread(topology.fan_start[vertex], np.diff(topology.fan_start)[vertex])
-    corner, vertex = topology.fan[corner], vertex[at]
-    row = topology.opposite.ravel()[corner]
-    kept = np.flatnonzero(row >= 0)
-    row, vertex = row[kept], vertex[kept]
-    first, count = topology.fan_start[vertex], np.diff(topology.fan_start)[vertex]
-    for part in parts(count):
-        other, at = spread(first[part], count[part])
-        edge, face = row[part][at], topology.fan[other] // 3
-        kept = np.flatnonzero(_apart(topology, edge, face))
-        edge, slot = edge[kept], layout.slot[face[kept]]
-        ends = np.stack([points.take(x, axis=1) for x in topology.ends[edge].T], axis=1)
-        extent = shape.extent[layout.slot[topology.edge_faces[edge, 0]]]
-        kept = np.flatnonzero(straddles(shape, ends, extent, slot))
-        yield edge[kept], slot[kept]
-
-
-def _apart(topology: Topology, row, face):
-    ends, corner = topology.ends[row], topology.faces[face]
-    return (ends[:, :, None] != corner[:, None, :]).all(axis=(1, 2))
-
-
-def _uncertain(points, topology: Topology, layout: Layout, shape: Shape):
-    """Vertices around which triangles have not been shown to lie side by side.
-
-    Let the triangles around a vertex all face a direction d with d_k = 0. Seen along d they turn
-    around the vertex in one sense, once for every two of them that lie across the plane of
-    constant x_k: once in all exactly if the vertex is the median of x_k in two of its triangles.
-    Then they do not overlap. Ties of x_k are broken by vertex number, as if moved by nothing.
-    """
-    # All three components at once: the sparse product is read once.
-    d = np.ascontiguousarray((layout.at_vertices @ np.ascontiguousarray(shape.normal.T)).T)
-    x, y, z = np.abs(d)
-    # argmin along a short axis takes four times as long.
-    axis = np.where((x <= y) & (x <= z), 0, np.where(y <= z, 1, 2))
-    d[axis, np.arange(len(axis))] = 0.0
-    length = np.abs(d).sum(axis=0)
-    d /= np.where(length > 0, length, 1.0)
-    at = d.take(layout.corners, axis=1)
-    facing = at[0] * shape.normal[0]
-    facing += at[1] * shape.normal[1]
-    facing += at[2] * shape.normal[2]
-    away = facing <= ROUNDING * shape.extent * shape.extent
-    away[:, layout.empty] = False
-    sure = topology.closed & (_medians(shape, layout, axis.astype(np.uint8)) == 2)
-    sure[layout.corners[away]] = False
-    return np.flatnonzero(~sure)
-
-
-def _medians(shape: Shape, layout: Layout, axis: UInt8[np.ndarray, "V"]) -> Int[np.ndarray, "V"]:
-    """In how many of its triangles each vertex is the median, along the axis that it names."""
-    # The number of the median corner along x, y and z, two bits each: bytes take an eighth of what
-    # whole numbers would.
-    medians = np.zeros(shape.corner.shape[2], np.uint8)
-    for k, x in enumerate(shape.corner):
-        # Corners are sorted by number, so this is what breaks ties.
-        first, second, third = x[0] <= x[1], x[1] <= x[2], x[2] < x[0]
-        middle = first == second
-        last = (second == third) & ~middle
-        medians |= (middle.view(np.uint8) | last.view(np.uint8) << 1) << (2 * k)
-    corner = (medians >> 2 * axis.take(layout.corners_32)) & 3
-    found = corner == np.arange(3, dtype=np.uint8)[:, None]
-    found[:, layout.empty] = False
-    return np.bincount(layout.corners.ravel().take(np.flatnonzero(found)), minlength=len(axis))
 
 
 def _edges_of_pairs(topology: Topology, layout: Layout, t, u):

@@ -1,56 +1,94 @@
-"""Pairs of triangles near each other, of a mesh that may have moved little since it was last seen.
+"""What was apart in an earlier shape of a mesh, and is so until it has moved by more than its gap.
 
 A search asks for meshes that moved by a millimetre. So once a mesh comes that has moved little
-since the last one, its boxes are grown, by a small part of a cluster, and the pairs of triangles
-whose grown boxes meet are kept: twice as many pairs. While two groups of clusters have moved
-against each other by less than their boxes were grown, no pair of theirs meets that is not kept,
-and what is kept only has to be compared again; groups that moved farther, one in eight, are
-searched anew. How far they moved is told along each axis by the least and the largest displacement
-of each group's vertices.
+since the last one, three things are kept of it: pairs of triangles near each other and how far they
+are apart at least, of all others that they are apart by more than a certain growth of their boxes,
+and of each corner how far its triangle may move and still face the direction that all around its
+vertex face (`fans.py`).
 
-Kept pairs never decide anything: whether they intersect is worked out from the coordinates of each
-call, and a pair too many changes nothing. So the results are those of a first call to the bit,
-whatever was seen before. What is kept is replaced as a whole, never written to, for any number of
-threads.
+The next shape is compared with that one: by how much the vertices of each group of clusters moved,
+as a box, and so by how much two groups moved against each other at most. Where that is less than
+the gap, the two triangles are still apart, and nobody looks at them: of 35,000 pairs kept, and as
+many corners, a few hundred are left after a step of a millimetre. Where two groups moved by more
+than boxes were grown, they are searched anew.
+
+Kept pairs never decide anything: what is proved apart does not intersect, by signs that are exact,
+and whatever is left is worked out from the coordinates of each call. So the results are those of a
+first call to the bit, whatever was seen before. What is kept is replaced as a whole, never written
+to, for any number of threads.
 """
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Float32, Int, Int32
 
+from spt_jax.overlap.ranges import unique
+from spt_jax.overlap.triangles.fans import facing
+from spt_jax.overlap.triangles.gaps import gaps
 from spt_jax.overlap.triangles.pair_boxes import (
     GUARDS,
     STEPS,
     Boxes,
-    Pairs,
     Shape,
     across_groups,
     around,
     concatenate,
     joined,
-    kept_meeting,
     meeting_boxes,
-    parts_of_size,
-    pieces,
     within_clusters,
     word,
 )
-from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
+from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared, Topology
 
 _GROUP = CLUSTER**2
-# Boxes grow on each side by this part of a usual cluster's extent: 0.3 mm on the embedded body.
-_GROWTH = 80
-# Where more of the groups that meet than this part have moved too far, all are searched.
+# Boxes grow on each side by this part of a usual cluster's extent: 0.6 mm on the embedded body.
+_GROWTH = 40
+# Of pairs farther apart than this part of the growth nobody asks how far.
+_ENOUGH = 0.3
+# Where vertices moved against each other by more than so many growths, the mesh is another one; and
+# groups whose boxes are apart by more are not compared at all.
+_FAR = 16
+# Where more of the groups than this part have moved too far, all are searched.
 _FEW = 0.4
-# A table of all pairs of groups is made at each call; larger meshes are searched every time. And so
-# are those of which so many pairs a triangle would be kept.
+# Larger meshes are searched every time, and so are those of which so many pairs a triangle would be
+# kept. Where more than this part of the pairs meet, above a number that does not matter, solids may
+# touch: by rank they are told apart (`near_triangles.py`), by what is kept they would be looked at.
 _MOST_GROUPS, _MOST_PAIRS_EACH = 2048, 8
-# Where one coordinate of two, of every so many vertices, moved by more than this many growths, the
-# mesh is another one, and groups are not looked at.
-_SOME, _MUCH = 64, 20.0
+_MANY, _MOST_MEETING = 1024, 0.1
+# To keep what is apart takes as long as two calls, and each one after it less than half as long as
+# before. Where it was used less often than this, the next is kept after more calls near each other.
+_WORTH, _MOST_PATIENCE = 1, 31
 # Beyond the growth, boxes are rounded by a step or two in either shape.
 _ROUNDED = 4
+# What rounding may add to how far something moved.
+_UP = 1 + 1e-12
+
+
+@dataclass(frozen=True)
+class Apart:
+    """What is apart in a shape.
+
+    Attributes:
+        start, vertex: group g has the vertices vertex[start[g] : start[g + 1]].
+        groups: (2, M), pairs of groups that are near each other, each with itself too.
+        growth: how far two groups may move against each other along an axis before pairs of
+            triangles meet that are not kept.
+        pairs: the slots of pairs that are.
+        of: of each pair the pair of groups.
+        gap: how far they are apart at least.
+        turns: for each corner how far the vertices of its triangle may move against each other.
+    """
+
+    start: Int[np.ndarray, "G1"]
+    vertex: Int[np.ndarray, "N"]
+    groups: Int[np.ndarray, "2 M"]
+    growth: float
+    pairs: Int32[np.ndarray, "2 P"]
+    of: Int32[np.ndarray, "P"]
+    gap: Float32[np.ndarray, "P"]
+    turns: Float32[np.ndarray, "3 S"]
 
 
 @dataclass(frozen=True)
@@ -61,87 +99,193 @@ class Kept:
         layout: of the triangles.
         scale: what coordinates had been multiplied by.
         points: the vertices.
-        growth: by how much two boxes together had been grown.
-        pairs: the slots of the pairs of different clusters whose grown boxes met, and of each the
-            two groups as one number; None where only the points are kept.
+        growth: by how much two boxes together are grown.
+        calm: how many calls before were near this shape, or near one that was, and so on.
+        apart: what is apart; None where only the points are kept.
     """
 
     layout: Layout
     scale: float
     points: Float[np.ndarray, "3 V"]
     growth: float
-    pairs: Int32[np.ndarray, "3 N"] | None = None
+    calm: int = 0
+    apart: Apart | None = None
 
 
-def warm_pairs(
-    mesh: Prepared,
-    points: Float[np.ndarray, "3 V"],
-    scale: float,
-    layout: Layout,
-    shape: Shape,
-    clusters: Boxes,
-    groups: Pairs,
-):
-    """As `near_pairs`, with what is kept of an earlier shape of the mesh.
+@dataclass(frozen=True)
+class Left:
+    """What has to be looked at.
+
+    Attributes:
+        layout: of the triangles.
+        pairs: slots of pairs of triangles.
+        vertex: vertices around which triangles may meet.
+        groups: pairs of groups whose pairs of triangles are not known.
+    """
+
+    layout: Layout
+    pairs: Int[np.ndarray, "2 P"]
+    vertex: Int[np.ndarray, "U"]
+    groups: Int[np.ndarray, "2 G"]
+
+
+def left_of(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float) -> Left | None:
+    """What is left to look at of a shape; None if nothing is known of one near it."""
+    kept = mesh.kept
+    if kept is None or kept.apart is None:
+        return None
+    found = _left_of(kept, kept.apart, points) if _is_near(mesh, kept, points, scale) else None
+    if found is not None:
+        mesh.used += 1
+        return found
+    # What was worth nothing is not kept again so soon.
+    mesh.patience = 0 if mesh.used >= _WORTH else min(2 * mesh.patience + 1, _MOST_PATIENCE)
+    mesh.kept, mesh.used = None, 0
+    return None
+
+
+def _left_of(kept: Kept, apart: Apart, points: Float[np.ndarray, "3 V"]) -> Left | None:
+    layout = kept.layout
+    moved = (points - kept.points).take(apart.vertex, axis=1)
+    least = np.minimum.reduceat(moved, apart.start[:-1], axis=1)
+    most = np.maximum.reduceat(moved, apart.start[:-1], axis=1)
+    a, b = apart.groups
+    farthest, square = np.zeros(len(a)), np.zeros(len(a))
+    for low, high in zip(least, most, strict=True):
+        along = np.maximum(high.take(a) - low.take(b), high.take(b) - low.take(a))
+        np.maximum(farthest, along, out=farthest)
+        square += along * along
+    far = ~(farthest <= apart.growth)
+    if far.mean() > _FEW:
+        return None
+    looked_at = apart.gap <= (_UP * np.sqrt(square)).take(apart.of)
+    if far.any():
+        looked_at &= ~far.take(apart.of)
+    pairs = apart.pairs.take(np.flatnonzero(looked_at), axis=1).astype(np.int64)
+    own = _UP * np.sqrt(((most - least) ** 2).sum(axis=0))
+    turned = apart.turns.reshape(3, -1, _GROUP) <= own[:, None]
+    marked = np.zeros(points.shape[1], bool)
+    marked[layout.corners[turned.reshape(3, -1)]] = True
+    return Left(layout, pairs, np.flatnonzero(marked), apart.groups[:, far])
+
+
+def _is_near(mesh: Prepared, kept: Kept, points, scale: float) -> bool:
+    """Whether a shape is so near one of which something is kept that groups are worth a look."""
+    if kept.layout is not mesh.layout or kept.scale != scale:
+        return False
+    return bool(np.ptp(points - kept.points, axis=1).max() <= _FAR * kept.growth)
+
+
+def keep(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float, boxes) -> Left | None:
+    """Keep of a shape what is apart in it if ones near it were seen before, else its points alone.
 
     Args:
         mesh: keeps it.
         points: the vertices.
         scale: what their coordinates were multiplied by.
-        layout, shape, clusters, groups: as `near_groups` gives them.
+        boxes: the layout, triangles and clusters, as `near_groups` gives them.
+
+    Returns:
+        What is left to look at of this shape; None where nothing but points is kept.
     """
-    yield from within_clusters(layout, shape)
-    count = clusters.low.shape[1] // CLUSTER
-    if count > _MOST_GROUPS:
-        yield from parts_of_size(across_groups(layout, shape, clusters, groups))
-        return
-    kept, a, b = mesh.kept, *concatenate(groups)
-    total = (2 * _growth(clusters) - _ROUNDED) * _step(shape)
-    far = np.ones(len(a), bool)
-    if kept is not None and kept.layout is layout and kept.scale == scale:
-        allowed = kept.growth - _ROUNDED * _step(shape)
-        moved = points - kept.points
-        if np.median(np.abs(moved[:, ::_SOME])) <= _MUCH * allowed:
-            far = _moved_far(layout, moved, a, b, allowed)
-    if far.mean() > _FEW:
-        yield from parts_of_size(across_groups(layout, shape, clusters, groups))
-        mesh.kept = Kept(layout, scale, points, total)
-    elif kept is None or kept.pairs is None:
-        yield from _kept_from(mesh, Kept(layout, scale, points, total), shape, clusters)
-    else:
-        groups = [(a[far], b[far])] if far.any() else []
-        yield from parts_of_size(across_groups(layout, shape, clusters, groups))
-        dropped = np.zeros(count * count, bool)
-        dropped[a[far] * count + b[far]] = True
-        for part in pieces(kept.pairs.shape[1], 1):
-            first, second, key = kept.pairs[:, part]
-            there = np.flatnonzero(~dropped.take(key))
-            yield kept_meeting(shape, first.take(there), second.take(there))
+    layout, shape, clusters = boxes
+    if clusters.low.shape[1] // CLUSTER > _MOST_GROUPS:
+        return None
+    before = mesh.kept
+    kept = Kept(layout, scale, points, (2 * _growth(clusters) - _ROUNDED) * shape.span / STEPS)
+    calm = 0
+    if before is not None and _is_near(mesh, before, points, scale):
+        calm = before.calm + 1
+    mesh.kept = kept = replace(kept, calm=calm)
+    if calm <= mesh.patience:
+        return None
+    apart = _apart(mesh.topology, kept, shape, clusters)
+    if apart is None:
+        mesh.kept, mesh.patience = None, _MOST_PATIENCE
+        return None
+    mesh.kept = replace(kept, apart=apart)
+    marked = np.zeros(points.shape[1], bool)
+    marked[layout.corners[apart.turns <= 0]] = True
+    pairs = apart.pairs.take(np.flatnonzero(apart.gap <= 0), axis=1).astype(np.int64)
+    return Left(layout, pairs, np.flatnonzero(marked), np.zeros((2, 0), np.int64))
 
 
-def _kept_from(mesh: Prepared, kept: Kept, shape: Shape, clusters: Boxes):
-    """The pairs across clusters, found by grown boxes, which are kept."""
+def _apart(topology: Topology, kept: Kept, shape: Shape, clusters: Boxes) -> Apart | None:
     layout, count = kept.layout, clusters.low.shape[1] // CLUSTER
+    filled = np.ones(len(layout.face), bool)
+    filled[layout.empty] = False
+    size = kept.points.shape[1]
+    slot = np.flatnonzero(filled)
+    number = unique((slot // _GROUP * size + layout.corners[:, slot]).ravel())
+    group, vertex = np.divmod(number, size)
+    start = np.searchsorted(group, np.arange(count + 1))
+    groups = _near_groups(clusters)
+    if (np.diff(start) == 0).any() or groups is None:
+        return None
+    pairs = _near_pairs(kept, shape, clusters)
+    if pairs is None:
+        return None
+    gap = gaps(shape, *pairs, _ENOUGH * kept.growth)
+    if np.count_nonzero(gap <= 0) > _MANY + _MOST_MEETING * len(gap):
+        return None
+    key = groups[0] * count + groups[1]
+    of_pairs = pairs // _GROUP
+    of = np.searchsorted(key, of_pairs.min(axis=0) * count + of_pairs.max(axis=0))
+    return Apart(
+        start=start,
+        vertex=vertex,
+        groups=groups,
+        growth=kept.growth,
+        pairs=pairs.astype(np.int32),
+        of=of.astype(np.int32),
+        gap=gap.astype(np.float32),
+        turns=_turns(topology, layout, shape),
+    )
+
+
+def _near_groups(clusters: Boxes) -> Int[np.ndarray, "2 M"] | None:
+    """Pairs of groups whose boxes are not farther apart than the distance that is far, sorted."""
+    boxes = clusters.around
+    if boxes is None:
+        return None
+    far = _FAR * _growth(clusters)
+    low, high = np.maximum(boxes.low - far, 0), np.minimum(boxes.high + far, STEPS + 1)
+    found = np.stack(concatenate(list(meeting_boxes(joined(low, high)))))
+    return found[:, np.lexsort(found[::-1])]
+
+
+def _near_pairs(kept: Kept, shape: Shape, clusters: Boxes) -> Int[np.ndarray, "2 P"] | None:
+    """Pairs of triangles whose grown boxes meet; None if too many."""
     grown = _grown(shape, _growth(clusters))
     around_groups = joined(*around(*around(grown.low, grown.high)))
     larger = joined(*around(grown.low, grown.high), around_groups)
-    found, size, most = [], 0, _MOST_PAIRS_EACH * len(layout.slot)
-    for t, u in across_groups(layout, grown, larger, list(meeting_boxes(around_groups))):
+    found, size, most = [], 0, _MOST_PAIRS_EACH * len(kept.layout.slot)
+    across = across_groups(kept.layout, grown, larger, list(meeting_boxes(around_groups)))
+    for t, u in chain(within_clusters(kept.layout, grown), across):
         size += len(t)
-        if size <= most:
-            found.append((t, u))
-        yield kept_meeting(shape, t, u)
-    if size > most:
-        mesh.kept = None
-        return
-    first, second = concatenate(found) if found else np.zeros((2, 0), np.int64)
-    key = (first // _GROUP) * count + second // _GROUP
-    mesh.kept = replace(kept, pairs=np.stack([first, second, key]).astype(np.int32))
+        if size > most:
+            return None
+        found.append(np.stack([t, u]))
+    return np.concatenate([np.zeros((2, 0), np.int64), *found], axis=1)
 
 
-def _step(shape: Shape) -> float:
-    """How long a step of the boxes' coordinates is."""
-    return shape.span / STEPS
+def _turns(topology: Topology, layout: Layout, shape: Shape) -> Float32[np.ndarray, "3 S"]:
+    """How far the vertices of each triangle may move against each other, for each of its corners.
+
+    Of a normal u x v with a = |u| + |v|, moves of r change it by r (a + r) at most: by less than
+    its part c along the direction that it has to face, if r is less than c / (a + c / a).
+    """
+    sure, faces, length = facing(topology, layout, shape)
+    sides = [shape.corner[:, (k + 1) % 3] - shape.corner[:, k] for k in range(3)]
+    long = np.sqrt([x[0] ** 2 + x[1] ** 2 + x[2] ** 2 for x in sides])
+    a = long.sum(axis=0) - long.max(axis=0)
+    a = np.where(a > 0, a, np.inf)
+    size = length.take(layout.corners)
+    c = faces / np.where(size > 0, size, np.inf)
+    found = c / (a + c / a) * (1 - 1e-6) - 1e-12
+    found[~sure.take(layout.corners)] = -1.0
+    found[:, layout.empty] = np.inf
+    return found.astype(np.float32)
 
 
 def _growth(clusters: Boxes) -> int:
@@ -154,15 +298,3 @@ def _grown(shape: Shape, growth: int) -> Shape:
     low = np.where(shape.low > STEPS + 1, shape.low, np.maximum(shape.low - growth, 0))
     high = np.where(shape.high > 0, np.minimum(shape.high + growth, STEPS + 1), 0)
     return replace(shape, low=low, high=high, low_word=word(low), high_word=word(high) | GUARDS)
-
-
-def _moved_far(layout: Layout, moved: Float[np.ndarray, "3 V"], a, b, allowed: float):
-    """Which pairs of groups have moved against each other by more than is allowed."""
-    at = moved.take(layout.corners, axis=1)
-    least = at.min(axis=1).reshape(3, -1, _GROUP).min(axis=2)
-    most = at.max(axis=1).reshape(3, -1, _GROUP).max(axis=2)
-    apart = np.zeros(len(a))
-    for low, high in zip(least, most, strict=True):
-        np.maximum(apart, high.take(a) - low.take(b), out=apart)
-        np.maximum(apart, high.take(b) - low.take(a), out=apart)
-    return ~(apart <= allowed)
