@@ -148,16 +148,29 @@ def test_little_is_looked_at_where_the_body_moved_a_millimetre():
     pair_layout._meshes.clear()
     mesh = prepared(faces, len(meshes[0]))
     results(meshes[0], faces)
-    assert mesh.kept.apart is None  # of a first mesh only its points
+    assert mesh.kept[0].apart is None  # of a first mesh only its points
     results(meshes[1], faces)
-    kept = mesh.kept
+    (kept,) = mesh.kept
     left, _ = unseen(mesh, meshes[2])
     assert left.pairs.shape[1] < 0.05 * kept.apart.pairs.shape[1]
     assert len(left.vertex) < 0.05 * len(meshes[2])
     assert left.groups.shape[1] < 0.05 * kept.apart.groups.shape[1]
-    assert mesh.kept is kept and mesh.used == 1
+    assert mesh.kept == (kept,) and mesh.waste == 0
     assert unseen(mesh, meshes[3])[0] is None  # another frame
-    assert mesh.kept is None
+    assert mesh.kept == (kept,)
+
+
+def test_shapes_that_come_in_turn_are_all_kept():
+    """A batch's meshes move a little from one call to the next, and are far from each other."""
+    meshes, faces = body_steps(np.random.default_rng(3), 4)
+    pair_layout._meshes.clear()
+    mesh = prepared(faces, len(meshes[0]))
+    used = []
+    for k in (0, 4, 1, 5, 2, 6, 3, 7):  # two frames, in turn
+        used.append(unseen(mesh, meshes[k])[0] is not None)
+        results(meshes[k], faces)
+    assert used == 4 * [False] + 4 * [True]
+    assert len(mesh.kept) == 2
 
 
 def test_what_was_of_no_use_is_kept_later():
@@ -167,15 +180,18 @@ def test_what_was_of_no_use_is_kept_later():
     pair_layout._meshes.clear()
     mesh = prepared(faces, len(vertices))
     made = []
-    for k in range(40):
-        results(vertices * (1 + 0.3 * (k % 4 > 1)), faces)
-        made.append(mesh.kept is not None and mesh.kept.apart is not None)
-    assert 0 < sum(made) <= 4
+    with pytest.MonkeyPatch.context() as changed:
+        changed.setattr(warm_pairs, "_SHAPES", 2)
+        for k in range(40):
+            turn = random_rotation(np.random.default_rng(k // 2))
+            results(vertices @ turn.T, faces)
+            made.append(bool(mesh.kept) and mesh.kept[0].apart is not None)
+            assert len(mesh.kept) <= 2
+    assert made[1] and 2 <= sum(made) <= 5
     for _ in range(warm_pairs._MOST_PATIENCE + 3):
         results(vertices, faces)
-    assert mesh.kept.apart is not None and mesh.used
-    results(2.0 * vertices, faces)
-    assert mesh.patience == 0
+    last = next(iter(mesh.kept))
+    assert last.apart is not None
 
 
 def test_gaps_are_lower_bounds_and_told_of_all_that_are_apart(rng):
@@ -204,9 +220,10 @@ def test_gaps_are_lower_bounds_and_told_of_all_that_are_apart(rng):
 def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
     vertices, faces = sphere(subdivisions=3)
     faces = np.asarray(faces, np.int64)
+    pair_layout._meshes.clear()
     for _ in range(2):
         results(vertices, faces)
-    kept = prepared(faces, len(vertices)).kept
+    (kept,) = prepared(faces, len(vertices)).kept
     assert kept.apart is not None
     known = (*vars(kept).values(), *vars(kept.apart).values())
     assert 0 < sum(x.nbytes for x in known if isinstance(x, np.ndarray)) < 400 * len(faces)
@@ -225,4 +242,4 @@ def test_what_is_kept_is_bounded_and_given_back(monkeypatch):
             for _ in range(3):
                 assert results(vertices, faces) == expected
             kept = prepared(faces, len(vertices)).kept
-            assert kept is None or kept.apart is None
+            assert all(one.apart is None for one in kept)

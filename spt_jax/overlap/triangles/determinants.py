@@ -41,7 +41,7 @@ def derivative(edges, turns):
         value = determinant(du, v) + determinant(u, dv)
         return value, BOUND * (speed[0] * size[1] + size[0] * speed[1]) + LEAST
     (u, v, w), (du, dv, dw) = edges, turns
-    value = 0.0
+    value = np.zeros(u.shape[1:])
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         minor = (du[i] * v[j] - du[j] * v[i]) + (u[i] * dv[j] - u[j] * dv[i])

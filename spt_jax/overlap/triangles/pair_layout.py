@@ -109,9 +109,8 @@ class Prepared:
     layout: Layout | None = None
     shapes: list[Float[np.ndarray, "F 6"]] = field(default_factory=list)
     usual_pairs: int = 0  # of groups whose boxes meet
-    kept: Any = None  # `warm_pairs.Kept`
-    used: int = 0  # how often what is kept was of use
-    patience: int = 0  # so many calls near each other before more than points are kept
+    kept: tuple[Any, ...] = ()  # `warm_pairs.Kept`, the last one used first
+    waste: int = 0  # how many more shapes were kept than were of use
 
     def arrange(self, box: Float[np.ndarray, "F 6"]) -> Layout:
         """A new layout, for this shape (each face's lowest and highest corner) and earlier ones."""

@@ -57,9 +57,13 @@ _FEW = 0.4
 # touch: by rank they are told apart (`near_triangles.py`), by what is kept they would be looked at.
 _MOST_GROUPS, _MOST_PAIRS_EACH = 2048, 8
 _MANY, _MOST_MEETING = 1024, 0.1
-# To keep what is apart takes as long as two calls, and each one after it less than half as long as
-# before. Where it was used less often than this, the next is kept after more calls near each other.
-_WORTH, _MOST_PATIENCE = 1, 31
+# Of every so many vertices some tell that a mesh is another one.
+_SOME = 64
+# So many shapes of a mesh are kept, for those that are asked for in turn: a batch's, frames' of a
+# motion. To keep what is apart takes as long as another call, and each call after it takes half as
+# long as before. So where many more shapes were kept than were of use, the next one has to be near
+# the last twice as often before more than its points are kept, but at most so often.
+_SHAPES, _MOST_PATIENCE = 16, 31
 # Beyond the growth, boxes are rounded by a step or two in either shape.
 _ROUNDED = 4
 # What rounding may add to how far something moved.
@@ -131,17 +135,17 @@ class Left:
 
 def left_of(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float) -> Left | None:
     """What is left to look at of a shape; None if nothing is known of one near it."""
-    kept = mesh.kept
-    if kept is None or kept.apart is None:
+    near = _nearest(mesh, points, scale)
+    if near is None or near.apart is None:
         return None
-    found = _left_of(kept, kept.apart, points) if _is_near(mesh, kept, points, scale) else None
-    if found is not None:
-        mesh.used += 1
-        return found
-    # What was worth nothing is not kept again so soon.
-    mesh.patience = 0 if mesh.used >= _WORTH else min(2 * mesh.patience + 1, _MOST_PATIENCE)
-    mesh.kept, mesh.used = None, 0
-    return None
+    found = _left_of(near, near.apart, points)
+    if found is None:
+        mesh.kept = _without(mesh, near)
+    else:
+        mesh.waste = max(mesh.waste - 1, 0)
+        if mesh.kept[0] is not near:
+            mesh.kept = (near, *_without(mesh, near))
+    return found
 
 
 def _left_of(kept: Kept, apart: Apart, points: Float[np.ndarray, "3 V"]) -> Left | None:
@@ -169,11 +173,25 @@ def _left_of(kept: Kept, apart: Apart, points: Float[np.ndarray, "3 V"]) -> Left
     return Left(layout, pairs, np.flatnonzero(marked), apart.groups[:, far])
 
 
-def _is_near(mesh: Prepared, kept: Kept, points, scale: float) -> bool:
-    """Whether a shape is so near one of which something is kept that groups are worth a look."""
-    if kept.layout is not mesh.layout or kept.scale != scale:
-        return False
-    return bool(np.ptp(points - kept.points, axis=1).max() <= _FAR * kept.growth)
+def _nearest(mesh: Prepared, points, scale: float) -> Kept | None:
+    """Of what is kept the first that is so near that groups are worth a look."""
+    for kept in mesh.kept:
+        if kept.layout is mesh.layout and kept.scale == scale and _is_near(kept, points):
+            return kept
+    return None
+
+
+def _is_near(kept: Kept, points) -> bool:
+    # A few vertices tell nearly all that are not.
+    for step in (_SOME, 1):
+        moved = points[:, ::step] - kept.points[:, ::step]
+        if not np.ptp(moved, axis=1).max() <= _FAR * kept.growth:
+            return False
+    return True
+
+
+def _without(mesh: Prepared, kept: Kept) -> tuple[Kept, ...]:
+    return tuple(one for one in mesh.kept if one is not kept)
 
 
 def keep(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float, boxes) -> Left | None:
@@ -191,22 +209,22 @@ def keep(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float, boxes) 
     layout, shape, clusters = boxes
     if clusters.low.shape[1] // CLUSTER > _MOST_GROUPS:
         return None
-    before = mesh.kept
-    kept = Kept(layout, scale, points, (2 * _growth(clusters) - _ROUNDED) * shape.span / STEPS)
-    calm = 0
-    if before is not None and _is_near(mesh, before, points, scale):
-        calm = before.calm + 1
-    mesh.kept = kept = replace(kept, calm=calm)
-    if calm <= mesh.patience:
+    before = _nearest(mesh, points, scale)
+    growth = (2 * _growth(clusters) - _ROUNDED) * shape.span / STEPS
+    calm = 0 if before is None else before.calm + 1
+    kept = Kept(layout, scale, points, growth, calm)
+    if calm > min(2 ** max(mesh.waste - _SHAPES, 0) - 1, _MOST_PATIENCE):
+        apart = _apart(mesh.topology, kept, shape, clusters)
+        mesh.waste = mesh.waste + 1 if apart is not None else _SHAPES + _MOST_PATIENCE
+        kept = replace(kept, calm=0, apart=apart)
+    others = [one for one in mesh.kept if one is not before and one.layout is mesh.layout]
+    mesh.kept = (kept, *others[: _SHAPES - 1])
+    if kept.apart is None:
         return None
-    apart = _apart(mesh.topology, kept, shape, clusters)
-    if apart is None:
-        mesh.kept, mesh.patience = None, _MOST_PATIENCE
-        return None
-    mesh.kept = replace(kept, apart=apart)
     marked = np.zeros(points.shape[1], bool)
-    marked[layout.corners[apart.turns <= 0]] = True
-    pairs = apart.pairs.take(np.flatnonzero(apart.gap <= 0), axis=1).astype(np.int64)
+    marked[layout.corners[kept.apart.turns <= 0]] = True
+    met = np.flatnonzero(kept.apart.gap <= 0)
+    pairs = kept.apart.pairs.take(met, axis=1).astype(np.int64)
     return Left(layout, pairs, np.flatnonzero(marked), np.zeros((2, 0), np.int64))
 
 
@@ -225,7 +243,7 @@ def _apart(topology: Topology, kept: Kept, shape: Shape, clusters: Boxes) -> Apa
     pairs = _near_pairs(kept, shape, clusters)
     if pairs is None:
         return None
-    gap = gaps(shape, *pairs, _ENOUGH * kept.growth)
+    gap = gaps(shape, pairs[0], pairs[1], _ENOUGH * kept.growth)
     if np.count_nonzero(gap <= 0) > _MANY + _MOST_MEETING * len(gap):
         return None
     key = groups[0] * count + groups[1]
