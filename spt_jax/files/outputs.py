@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jax import Array
 
 # What writing meets where a disk, a quota or the largest size of a file is reached, or it breaks.
 _FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}
@@ -90,7 +89,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """
 
     def plain(item: Any) -> Any:
-        if isinstance(item, np.ndarray | np.generic | Array):
+        if hasattr(item, "__array__"):  # NumPy's and JAX's, which is not imported for this
             return np.asarray(item).tolist()
         if isinstance(item, os.PathLike):
             return os.fspath(item)

@@ -1,0 +1,40 @@
+"""Who works on the files of a data set: processes of this machine, or a Ray cluster.
+
+An engine takes a store, a task and files, and gives `Finished` and `Progress` as they come. It
+has no state worth keeping: what is done stands in the store.
+"""
+
+from typing import Any, NamedTuple
+
+from spt_jax.datasets.inventory import Item
+
+
+class Progress(NamedTuple):
+    """What is done of a file.
+
+    Attributes:
+        name: the file.
+        done, total: how many of its frames, or people.
+        text: what is done now.
+    """
+
+    name: str
+    done: int
+    total: int
+    text: str
+
+
+class Finished(NamedTuple):
+    """A file has its row.
+
+    Attributes:
+        item: the file.
+        row: None where another run works on it.
+    """
+
+    item: Item
+    row: dict[str, Any] | None
+
+
+class StartError(RuntimeError):
+    """A process cannot start on the task at all; the message says why."""
