@@ -61,7 +61,7 @@ def texts(folder: Path, count=12, *, special=()):
     for k in range(count):
         path = folder / f"part{k % 3}" / f"text{k}.txt"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("".join(rng.choice(list("abcdefgh"), size=50 + 10 * k)))
+        path.write_text("".join(rng.choice(list("efgh"), size=50 + 10 * k)))
         names.append(path.relative_to(folder).as_posix())
     for word in special:
         (folder / f"{word}.txt").write_text(f"{word} text")

@@ -1,4 +1,4 @@
-"""The command line: spt-jax demo, check, untangle, fit and view."""
+"""The command line: spt-jax demo, check, untangle, fit, clean, measure and view."""
 
 import os
 import sys
@@ -9,21 +9,32 @@ from typing import NoReturn
 import tyro
 
 from spt_jax.cli.check import check
+from spt_jax.cli.clean import clean
 from spt_jax.cli.demo import demo
 from spt_jax.cli.fit import fit
+from spt_jax.cli.measure import measure
 from spt_jax.cli.streams import OutputLostError, guarded_streams
 from spt_jax.cli.terminal import CommandError
 from spt_jax.cli.untangle import untangle
 from spt_jax.cli.view import view
 
-_COMMANDS = {"demo": demo, "check": check, "untangle": untangle, "fit": fit, "view": view}
+_COMMANDS = {
+    "demo": demo,
+    "check": check,
+    "untangle": untangle,
+    "fit": fit,
+    "clean": clean,
+    "measure": measure,
+    "view": view,
+}
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
     0: done. 1: `check` found a self-intersection, `untangle` left one in a mesh, or `fit` could not
-    fit somebody or put somebody where no photograph could show them. 2: the input or the output
+    fit somebody or put somebody where no photograph could show them, or a file of a folder could
+    not be worked on. 2: the input or the output
     folder is at fault, the output takes no more, or a surface is none that could be measured, said
     in one line on the standard error stream. 130: interrupted. 141: the output is a pipe whose
     reader has gone.

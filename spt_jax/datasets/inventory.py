@@ -1,4 +1,4 @@
-"""What lies in a folder: the files of a data set by name, what else there is, and who takes what."""
+"""What lies in a folder: the files of a data set, what else there is, and who takes what."""
 
 import hashlib
 import os
@@ -111,11 +111,11 @@ def as_shard(shard: str | tuple[int, int] | None) -> Shard:
     if shard is None:
         return Shard(0, 1)
     try:
-        number, count = (int(part) for part in (shard.split("/") if isinstance(shard, str) else shard))
+        number, count = (
+            int(part) for part in (shard.split("/") if isinstance(shard, str) else shard)
+        )
     except ValueError:
         number, count = 0, 0
     if not 0 <= number < count:
-        raise ValueError(
-            f"shard must be i/n with i from 0 to n - 1, such as 0/8: got {shard!r}."
-        )
+        raise ValueError(f"shard must be i/n with i from 0 to n - 1, such as 0/8: got {shard!r}.")
     return Shard(number, count)

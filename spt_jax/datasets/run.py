@@ -3,14 +3,14 @@
 import os
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Literal
 
 from spt_jax.datasets.engines import Finished, Progress
 from spt_jax.datasets.engines.cluster import Resources, cluster
 from spt_jax.datasets.engines.local import local
-from spt_jax.datasets.inventory import Inventory, Item, as_shard, take_inventory
+from spt_jax.datasets.inventory import Item, as_shard, take_inventory
 from spt_jax.datasets.store import Store
 from spt_jax.datasets.summary import Summary, write_results
 from spt_jax.datasets.work import Task, is_whole, usable_cores
@@ -36,7 +36,7 @@ def run(
     anew: bool = False,
     retry: bool = False,
     verify: bool = False,
-    ray: Resources = Resources(),
+    ray: Resources | None = None,
     on_event: OnEvent | None = None,
 ) -> Summary:
     """Have a task done with every file of a folder, and results that are whole, once each.
@@ -56,7 +56,7 @@ def run(
         anew: do what is done again, whatever the settings were.
         retry: try files again that failed.
         verify: compare what is done with its hashes, rather than its sizes.
-        ray: what the engine "ray" asks of the cluster.
+        ray: what the engine "ray" asks of the cluster, a `Resources`; by default a core a file.
         on_event: called with a `Finished` for each file, and with `Progress` on the way.
 
     Returns:
@@ -98,12 +98,13 @@ def run(
     mine = [item for item in found.items if part.has(item.name)]
     left = _left(store, mine, retry, verify)
     kept = len(mine) - len(left)
+    report(Progress("", kept, len(mine), "files"))
     try:
         # The longest first: the last ones to be done then keep nobody waiting for long.
         left.sort(key=lambda item: (-item.size, item.name))
         while left:
             events = (
-                cluster(store, task, left, ray)
+                cluster(store, task, left, ray or Resources())
                 if engine == "ray"
                 else local(store, task, left, count)
             )
@@ -115,9 +116,12 @@ def run(
                     else:
                         report(event)
             left = _left_by_others(store, busy, report)
-    finally:
-        summary = _results(store, task, found, time.perf_counter() - begin, kept)
-    return summary
+    except BaseException:
+        # What is done is told, at least where there is room for it.
+        with suppress(OSError):
+            write_results(store, task, found, time.perf_counter() - begin, kept, draw=False)
+        raise
+    return write_results(store, task, found, time.perf_counter() - begin, kept)
 
 
 def _left(store: Store, items: Sequence[Item], retry: bool, verify: bool) -> list[Item]:
@@ -155,12 +159,6 @@ def _left_by_others(store: Store, items: Sequence[Item], report: OnEvent) -> lis
             report(Progress(still[0].name, 0, 1, "another run works on it"))
             time.sleep(_PATIENCE)
     return free
-
-
-def _results(store: Store, task: Task, found: Inventory, seconds: float, kept: int) -> Summary:
-    with store.whole():
-        rows = [row for item in found.items if (row := store.row(item.name)) is not None]
-        return write_results(store, task, found, rows, seconds, kept)
 
 
 def _as_folders(folder: Any, out: Any) -> tuple[Path, Path]:

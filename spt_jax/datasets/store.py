@@ -1,17 +1,18 @@
 """What is done of a data set: a row and whole outputs for each file, whoever works where.
 
 All of it lies in the folder of the results. `OUT/.spt-jax` holds `settings.json`, a row for each
-file that is done, what is being written, and `claims`, a file of which nothing but bytes are locked.
+file that is done, what is being written, and `claims`, a file of which nothing but bytes are
+locked.
 
 A result counts from the moment at which its row stands. Outputs are written into a folder of their
-own, moved to their places, and then the row is, each by a rename, which is whole or does not happen:
-a process that is killed in between leaves work that is done again, and no half of anything. Rows say
-how long each output is and what its hash is; nothing is forced to the disk, because a machine that
-loses its power loses what these tell to be missing.
+own and moved to their places, and then the row is, each by a rename, which happens whole or not at
+all: a process that is killed in between leaves work that is done again, and no half of anything.
+Rows have the length and the hash of each output, and nothing is forced to the disk: what a machine
+loses with its power is told by them, and made again.
 
-Who works on a file has locked one byte of `claims`, at a place that the file's name says. Such locks
-end with their process, however that ends, and hold between machines where the file system has them
-(NFS has); where it has none, two runs on one folder do the same work twice and write the same.
+Who works on a file has locked one byte of `claims`, at a place that the file's name says. Such a
+lock ends with its process, however that ends, and holds between machines where the file system has
+locks (NFS has); where it has none, two runs on one folder do the same work and write the same.
 """
 
 import errno
@@ -21,7 +22,7 @@ import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -81,6 +82,11 @@ class Store:
                 "start anew (--anew), which replaces them."
             )
 
+    @staticmethod
+    def key(name: str) -> str:
+        """A name's hash, as part of a file's name."""
+        return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
     def row(self, name: str) -> dict[str, Any] | None:
         """The row of a file; None where it is not done, or the row is damaged."""
         try:
@@ -107,7 +113,7 @@ class Store:
     @contextmanager
     def staging(self, name: str) -> Iterator[Path]:
         """An empty folder for the outputs of a file that is claimed, gone afterwards."""
-        folder = self.folder / "staging" / _key(name)
+        folder = self.folder / "staging" / self.key(name)
         shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
         folder.mkdir(parents=True)
         try:
@@ -148,7 +154,7 @@ class Store:
     @contextmanager
     def claim(self, name: str) -> Iterator[bool]:
         """Whether the file is this process' to work on while the block runs; it does not wait."""
-        place = 1 + int(_key(name)[:15], 16)
+        place = 1 + int(self.key(name)[:15], 16)
         with _claims.lock(self.folder / "claims", place, wait=False) as taken:
             yield taken
 
@@ -159,7 +165,7 @@ class Store:
             yield
 
     def _row(self, name: str) -> Path:
-        key = _key(name)
+        key = self.key(name)
         return self.folder / "rows" / key[:2] / f"{key}.json"
 
 
@@ -177,10 +183,6 @@ def sha256(path: Path) -> str:
     """The hash of a file's content."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _key(name: str) -> str:
-    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
 class _Claims:
@@ -253,10 +255,8 @@ def _lock(descriptor: int, place: int, wait: bool) -> bool:
 
 
 def _quietly(function: Any, *arguments: Any) -> None:
-    try:
+    with suppress(OSError):
         function(*arguments)
-    except OSError:
-        pass
 
 
 _claims = _Claims()

@@ -5,21 +5,22 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from spt_jax._result import Result
 from spt_jax.datasets.inventory import Inventory
 from spt_jax.datasets.store import Store
 from spt_jax.datasets.work import Task
 from spt_jax.files.outputs import atomic_write, write_json
 
 # Of these, neither sum nor mean says anything.
-_NOT_SUMMED = {"input_modified_ns", "frame_rate"}
+_NOT_SUMMED = {"input_modified_ns", "frame_rate", "worst_frame"}
 
 Row = Mapping[str, Any]
 
 
-class Summary(Result):
+@dataclass(frozen=True)
+class Summary:
     """What came of a data set.
 
     Attributes:
@@ -52,40 +53,52 @@ class Summary(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """All of it as JSON types."""
-        return {
-            "task": self.task,
-            "files": self.files,
-            "by_status": self.by_status,
-            "missing": self.missing,
-            "kept": self.kept,
-            "others": self.others,
-            "seconds": self.seconds,
-            "figures": self.figures,
-            "failures": self.failures,
-        }
+        return asdict(self)
 
 
 def write_results(
-    store: Store, task: Task, found: Inventory, rows: Sequence[Row], seconds: float, kept: int
+    store: Store,
+    task: Task,
+    found: Inventory,
+    seconds: float,
+    kept: int,
+    *,
+    draw: bool = True,
 ) -> Summary:
     """Write the rows, the summary and the report; the summary.
+
+    Args:
+        store, task, found: the data set.
+        seconds, kept: of this run.
+        draw: whether pictures that are missing are drawn.
 
     Raises:
         OSError: there is no room.
     """
-    summary = summarized(task.name, found, rows, seconds, kept)
-    _write(store, "manifest.jsonl", "".join(f"{json.dumps(row)}\n" for row in rows))
-    _write(store, "manifest.csv", as_csv(rows))
-    people = [
-        {"name": row["name"], **person} for row in rows for person in row.get("people", ())
-    ]
-    if people:
-        _write(store, "people.csv", as_csv(people))
-    write_json(store.out / "summary.json", summary.as_dict())
-    write_report: Callable[..., str] | None = getattr(task, "write_report", None)
-    if write_report is not None:
-        _write(store, "report.html", write_report(store, found, rows, summary))
+    drawing: Callable[..., str] | None = getattr(task, "draw", None)
+    why_not = "the run was ended"
+    if drawing is not None and draw:  # which takes seconds, before others are kept waiting
+        why_not = drawing(store, found, _rows(store, found))
+    with store.whole():
+        rows = _rows(store, found)
+        summary = summarized(task.name, found, rows, seconds, kept)
+        _write(store, "manifest.jsonl", "".join(f"{json.dumps(row)}\n" for row in rows))
+        _write(store, "manifest.csv", as_csv(rows))
+        people = [
+            {"name": row["name"], **person} for row in rows for person in row.get("people", ())
+        ]
+        if people:
+            _write(store, "people.csv", as_csv(people))
+        write_json(store.out / "summary.json", summary.as_dict())
+        if drawing is not None:
+            from spt_jax.datasets.report import page
+
+            _write(store, "report.html", page(store, rows, summary, why_not))
     return summary
+
+
+def _rows(store: Store, found: Inventory) -> list[dict[str, Any]]:
+    return [row for item in found.items if (row := store.row(item.name)) is not None]
 
 
 def _write(store: Store, name: str, text: str) -> None:
@@ -142,7 +155,9 @@ def as_csv(rows: Sequence[Row]) -> str:
         a,a.npz,
         b,,3
     """
-    columns = dict.fromkeys(key for row in rows for key, value in row.items() if _cell(value) is not None)
+    columns = dict.fromkeys(
+        key for row in rows for key, value in row.items() if _cell(value) is not None
+    )
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)

@@ -13,7 +13,7 @@ class Progress(NamedTuple):
     """What is done of a file.
 
     Attributes:
-        name: the file.
+        name: the file; "" says how many files are done of how many, once, at the start.
         done, total: how many of its frames, or people.
         text: what is done now.
     """

@@ -174,9 +174,9 @@ class _Worker:
 
     def __init__(self, store: Store):
         # A file without a name: nothing of it is left, and nothing is written elsewhere.
-        self._said = tempfile.TemporaryFile(dir=store.folder)
+        self._said = tempfile.TemporaryFile(dir=store.folder)  # noqa: SIM115, closed by `close`
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _BOOT, json.dumps([os.path.abspath(path) for path in sys.path])],
+            [sys.executable, "-c", _BOOT, json.dumps([os.path.abspath(p) for p in sys.path])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._said,

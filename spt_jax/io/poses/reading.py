@@ -53,6 +53,10 @@ def is_pose_file(path: str | os.PathLike[str]) -> bool:
     return os.path.splitext(os.fspath(path))[1].lower() in (*SUFFIXES, *_OTHERS, "")
 
 
+class UnknownStructureError(ValueError):
+    """A file that was read and holds poses in no structure that is known, or no poses."""
+
+
 class Structure(NamedTuple):
     """A structure of pose files.
 
@@ -172,7 +176,7 @@ def read_motion(container: Container) -> MotionFile:
     with file_errors(WHAT, container.path):
         structure = next((one for one in STRUCTURES if one.matches(source.tree)), None)
         if structure is None:
-            raise ValueError(_unknown(source))
+            raise UnknownStructureError(_unknown(source))
         tracks = structure.read(source)
         if not tracks:
             raise ValueError(

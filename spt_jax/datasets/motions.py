@@ -1,0 +1,388 @@
+"""Pose files of a folder measured, or freed of collisions, each as a whole motion."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from spt_jax.datasets.figures import file_figures, overlap_figures, worst_frame
+from spt_jax.datasets.run import run
+from spt_jax.datasets.summary import Summary
+from spt_jax.datasets.work import Report, UnknownFileError
+from spt_jax.io.poses.reading import SUFFIXES, UnknownStructureError, open_poses
+from spt_jax.metrics import MotionOverlap, motion_overlap
+
+if TYPE_CHECKING:
+    from spt_jax.body import BodyModel
+    from spt_jax.datasets.inventory import Inventory
+    from spt_jax.datasets.store import Store
+    from spt_jax.io.poses.track import MotionFile, Track
+    from spt_jax.rest.surface import RestSurface
+
+# More shape components than AMASS and BEDLAM write, fewer than take long to load.
+_SHAPE_COMPONENTS = 16
+
+
+@dataclass
+class MeasureMotions:
+    """The overlap of each frame of each file, and nothing changed.
+
+    Attributes:
+        body: "anny", or the path of a body model.
+        fold_distance: as in `untangle_motion`.
+        max_bytes: what a file may take.
+        pictures: how many of the worst files the report shows pictures of.
+    """
+
+    body: str = "anny"
+    fold_distance: float | None = None
+    max_bytes: int | None = None
+    pictures: int = 10
+    name: str = field(default="measure", init=False)
+
+    def settings(self) -> dict[str, Any]:
+        """All that a figure depends on."""
+        return {"body": _body_key(self.body), "fold_distance": self.fold_distance}
+
+    def wants(self, path: Path) -> bool:
+        """Whether the suffix is one of pose files."""
+        return path.suffix.lower() in SUFFIXES
+
+    def start(self) -> None:
+        """Load the body."""
+        from spt_jax._exclusions import as_fold_surface
+        from spt_jax.body import load_body
+
+        self.body_model: BodyModel = load_body(
+            self.body, num_shape=_SHAPE_COMPONENTS, max_bytes=self.max_bytes
+        )
+        self.rest_surface: RestSurface = as_fold_surface(self.body_model, self.fold_distance)
+
+    def work(self, path: Path, out: Path, report: Report) -> dict[str, Any]:
+        """The figures of a file's people."""
+        file = self._opened(path)
+        total = sum(len(track.pose) for track in file.tracks)
+        people, done = [], 0
+        for track in file.tracks:
+            overlap = self._measured(track, done, total, report)
+            found = {"person": track.name, "frames": len(track.pose)}
+            found |= {"worst_frame": worst_frame(overlap), **overlap_figures(overlap)}
+            people.append(found | {"frame_rate": track.frame_rate})
+            done += len(track.pose)
+        return self._row(file, people, file.notes)
+
+    def prepare(self) -> None:
+        """Load the body, if it is not there."""
+        if not hasattr(self, "body_model"):
+            self.start()
+
+    def draw(self, store: "Store", found: "Inventory", rows: list[dict[str, Any]]) -> str:
+        """Draw the worst frames for the report; why there are no pictures, if there are none."""
+        from spt_jax.datasets.pictures import draw_worst
+
+        return draw_worst(self, store, found.items, rows)
+
+    def _opened(self, path: Path) -> "MotionFile":
+        try:
+            return open_poses(path, max_bytes=self.max_bytes)
+        except UnknownStructureError as error:
+            raise UnknownFileError(str(error)) from error
+
+    def _measured(self, track: "Track", done: int, total: int, report: Report) -> MotionOverlap:
+        from spt_jax.datasets.tracks import on_body, skins
+
+        posed = on_body(track, self.body_model, embedded=self.body == "anny")
+        faces = np.asarray(self.body_model.faces)
+        pieces = []
+        for vertices in skins(self.body_model, posed):
+            pieces.append(motion_overlap(vertices, faces, rest_surface=self.rest_surface))
+            done += len(vertices)
+            report(done, total, track.name)
+        columns = zip(*(piece.columns() for piece in pieces), strict=True)
+        return MotionOverlap(*(np.concatenate(column) for column in columns))
+
+    def _row(self, file: "MotionFile", people: list[dict[str, Any]], notes: Any) -> dict[str, Any]:
+        worst = max(people, key=lambda one: one.get("largest_depth_before", 0.0))
+        return {
+            "structure": file.structure,
+            **file_figures(people),
+            "worst_person": worst["person"],
+            "worst_frame": worst["worst_frame"],
+            "frame_rate": people[0]["frame_rate"],
+            "notes": list(dict.fromkeys(notes)),
+            "people": people,
+        }
+
+
+@dataclass
+class CleanMotions(MeasureMotions):
+    """Each file with the nearest poses that do not collide, as smooth as it was.
+
+    Attributes:
+        structure: "input" writes each file again in its own structure, "amass" an .npz a person.
+        frame_rate: of files that say none, in frames a second.
+        fade, margin, feet: as in `untangle_motion`.
+    """
+
+    structure: Literal["input", "amass"] = "input"
+    frame_rate: float = 30.0
+    fade: float = 0.05
+    margin: float = 0.002
+    feet: float = 1.0
+    name: str = field(default="clean", init=False)
+
+    def settings(self) -> dict[str, Any]:
+        """All that a result depends on."""
+        own = ("structure", "frame_rate", "fade", "margin", "feet")
+        return super().settings() | {key: getattr(self, key) for key in own}
+
+    def work(self, path: Path, out: Path, report: Report) -> dict[str, Any]:
+        """Free a file's people, and write them."""
+        file = self._opened(path)
+        total = sum(len(track.pose) for track in file.tracks)
+        people, poses, notes, done = [], {}, list(file.notes), 0
+        for track in file.tracks:
+            found, pose, said = self._freed(track, done, total, report)
+            people.append(found)
+            poses[track.name] = pose
+            notes += said
+            done += len(track.pose)
+        report(total, total, "writing")
+        notes += self._write(file, poses, out)
+        return self._row(file, people, notes)
+
+    def _freed(
+        self, track: "Track", done: int, total: int, report: Report
+    ) -> tuple[dict[str, Any], np.ndarray, tuple[str, ...]]:
+        from spt_jax.datasets.tracks import (
+            displacements,
+            in_track,
+            on_body,
+            second_differences,
+            up_of,
+        )
+        from spt_jax.untangle.motion import MotionStep, untangle_motion
+
+        body = self.body_model
+        posed = on_body(track, body, embedded=self.body == "anny")
+        up = up_of(posed.pose)
+
+        def on_step(step: MotionStep) -> None:
+            report(done + step.first, total, f"{track.name}: {step.colliding} frames collide")
+
+        report(done, total, track.name)
+        result = untangle_motion(
+            body,
+            posed.pose,
+            shape=posed.shape,
+            # Without one, feet stand where they are lowest in each frame.
+            translation=None if track.translation is None else posed.translation,
+            frames_per_second=track.frame_rate or self.frame_rate,
+            fade=self.fade,
+            fold_distance=self.fold_distance,
+            margin=self.margin,
+            feet=self.feet,
+            up=up,
+            on_step=on_step,
+        )
+        after = posed._replace(pose=np.asarray(result.pose))
+        moved = bool(np.any(result.moved))
+        rough = second_differences(body, posed)
+        rougher = second_differences(body, after) if moved else rough
+        mean, largest = displacements(body, posed, after) if moved else (0.0, 0.0)
+        found = {
+            "person": track.name,
+            "frames": len(track.pose),
+            "moved_frames": int(np.count_nonzero(result.moved)),
+            "worst_frame": worst_frame(result.before),
+            **overlap_figures(result.before, "_before"),
+            **overlap_figures(result.after, "_after"),
+            "mean_displacement": mean,
+            "largest_displacement": largest,
+            "mean_second_difference_before": rough[0],
+            "mean_second_difference_after": rougher[0],
+            "largest_second_difference_before": rough[1],
+            "largest_second_difference_after": rougher[1],
+            "frame_rate": track.frame_rate,
+        }
+        return found, in_track(track, body, posed.pose, after.pose), posed.notes
+
+    def _write(self, file: "MotionFile", poses: dict[str, np.ndarray], out: Path) -> list[str]:
+        if self.structure == "input":
+            return list(file.write(out / file.path.name, poses))
+        from spt_jax.io.pose_files import write_poses
+
+        # The suffix stays where it tells files apart: a.npz and a.pkl may lie beside each other.
+        stem = file.path.stem if file.path.suffix.lower() == ".npz" else file.path.name
+        for number, track in enumerate(file.tracks):
+            person = f"_{number}" if len(file.tracks) > 1 else ""
+            write_poses(
+                out / f"{stem}{person}.npz",
+                poses[track.name],
+                shape=track.shape,
+                translation=track.translation,
+                names=track.names,
+                frame_rate=track.frame_rate,
+                gender=track.gender,
+            )
+        return []
+
+
+def clean(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    body: str = "anny",
+    structure: Literal["input", "amass"] = "input",
+    frame_rate: float = 30.0,
+    fade: float = 0.05,
+    fold_distance: float | None = None,
+    margin: float = 0.002,
+    feet: float = 1.0,
+    max_bytes: int | None = None,
+    pictures: int = 10,
+    **how: Any,
+) -> Summary:
+    """Free every motion of a folder from collisions, as smooth as it was, into another folder.
+
+    Each pose file that `load_poses` reads is freed by `untangle_motion`, in whichever structure it
+    is. Whatever ends the run, the same call goes on with what is not done.
+
+    Args:
+        folder: the data set; folders in it are looked through too.
+        out: where results go, made where missing: each file in the place that it has in `folder`;
+            manifest.jsonl and manifest.csv with a row a file, people.csv with one a person,
+            summary.json and report.html.
+        body: "anny", or the path of a body model.
+        structure: "input" writes each file again in its own structure, form and precision, "amass"
+            an .npz a person in AMASS' layout.
+        frame_rate: of files that say none, in frames a second.
+        fade, fold_distance, margin, feet: as in `untangle_motion`; which way is up is told from
+            how the trunk stands in most frames.
+        max_bytes: what a file and its arrays may take; 1 GiB where None.
+        pictures: how many of the worst files the report shows before and after.
+        how: as in `run`: engine, processes, shard, anew, retry, verify, ray, on_event.
+
+    Returns:
+        The summary, as in summary.json. Lengths are in metres, volumes in m^3.
+
+    Raises:
+        As `run`.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from spt_jax import load_mocap
+        >>> from spt_jax.datasets import clean
+        >>> from spt_jax.io import read_poses, write_poses
+        >>> mocap = load_mocap()
+        >>> k = mocap.names.index("cartwheel/0102")
+        >>> with tempfile.TemporaryDirectory() as top:
+        ...     folder, out = pathlib.Path(top, "in"), pathlib.Path(top, "out")
+        ...     folder.mkdir()
+        ...     write_poses(folder / "cartwheel.npz", mocap.pose[k : k + 3], frame_rate=30)
+        ...     found = clean(folder, out, processes=0, pictures=0)
+        ...     shape = read_poses(out / "cartwheel.npz").pose.shape
+        >>> found.by_status, shape
+        ({'done': 1}, (3, 22, 3))
+        >>> found.figures["colliding_frames_before"], found.figures["colliding_frames_after"]
+        (2.0, 0.0)
+    """
+    if structure not in ("input", "amass"):
+        raise ValueError(f'structure must be "input" or "amass": got {structure!r}.')
+    _check_positive(frame_rate=frame_rate, fade=fade)
+    _check_not_negative(margin=margin, feet=feet, pictures=pictures)
+    task = CleanMotions(
+        body=os.fspath(body),
+        fold_distance=_as_fold_distance(fold_distance),
+        max_bytes=max_bytes,
+        pictures=pictures,
+        structure=structure,
+        frame_rate=frame_rate,
+        fade=fade,
+        margin=margin,
+        feet=feet,
+    )
+    return run(task, folder, out, **how)
+
+
+def measure(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    body: str = "anny",
+    fold_distance: float | None = None,
+    max_bytes: int | None = None,
+    pictures: int = 10,
+    **how: Any,
+) -> Summary:
+    """Measure the collisions of every motion of a folder; nothing in it is changed.
+
+    Args:
+        folder, body, fold_distance, max_bytes, pictures, how: as in `clean`.
+        out: where the figures go: manifest.jsonl, manifest.csv, people.csv, summary.json and
+            report.html.
+
+    Returns:
+        The summary, as in summary.json.
+
+    Raises:
+        As `run`.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from spt_jax import load_mocap
+        >>> from spt_jax.datasets import measure
+        >>> from spt_jax.io import write_poses
+        >>> mocap = load_mocap()
+        >>> k = mocap.names.index("cartwheel/0102")
+        >>> with tempfile.TemporaryDirectory() as top:
+        ...     folder = pathlib.Path(top, "in")
+        ...     folder.mkdir()
+        ...     write_poses(folder / "cartwheel.npz", mocap.pose[k : k + 3])
+        ...     found = measure(folder, pathlib.Path(top, "out"), processes=0, pictures=0)
+        >>> found.figures["frames"], found.figures["colliding_frames"]
+        (3.0, 2.0)
+    """
+    _check_not_negative(pictures=pictures)
+    task = MeasureMotions(
+        body=os.fspath(body),
+        fold_distance=_as_fold_distance(fold_distance),
+        max_bytes=max_bytes,
+        pictures=pictures,
+    )
+    return run(task, folder, out, **how)
+
+
+def _body_key(body: str) -> str:
+    """The body's name, or the hash of its file: where it lies does not matter."""
+    if body == "anny":
+        return body
+    from spt_jax.datasets.store import sha256
+    from spt_jax.files.limits import as_file
+
+    return f"sha256:{sha256(as_file(body, 'body model'))}"
+
+
+def _as_fold_distance(value: Any) -> float | None:
+    from spt_jax._exclusions import as_fold_distance
+
+    return as_fold_distance(value)
+
+
+def _check_positive(**numbers: Any) -> None:
+    _check(lambda value: 0 < value < np.inf, "positive", numbers)
+
+
+def _check_not_negative(**numbers: Any) -> None:
+    _check(lambda value: 0 <= value < np.inf, "not negative", numbers)
+
+
+def _check(good: Callable[[Any], bool], rule: str, numbers: dict[str, Any]) -> None:
+    for name, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise TypeError(f"{name} must be a number: got {value!r}.")
+        if not good(value):
+            raise ValueError(f"{name} must be finite and {rule}: got {value!r}.")

@@ -1,0 +1,129 @@
+"""A track of a pose file as a motion of a body, and back; and how such a motion moves."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from spt_jax.body import BodyModel
+from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.body.rotations import matrix_from_axis_angle
+from spt_jax.io.pose_files import Track
+
+# Frames that are posed at a time: one program does for any number.
+BATCH = 8
+
+
+class Posed(NamedTuple):
+    """A track on a body, in its precision.
+
+    Attributes:
+        pose: axis-angle of each frame, in radians.
+        shape: coefficients of each frame; the body's mean where the file has none that it takes.
+        translation: in metres; zero where the file has none.
+        notes: what was left out.
+    """
+
+    pose: Float[np.ndarray, "T J 3"]
+    shape: Float[np.ndarray, "T B"]
+    translation: Float[np.ndarray, "T 3"]
+    notes: tuple[str, ...]
+
+
+def on_body(track: Track, body: BodyModel, *, embedded: bool) -> Posed:
+    """A track on a body.
+
+    Args:
+        track: of a pose file.
+        body: whose joints are found by name.
+        embedded: whether it is the body of the package, whose shape components are not SMPL's.
+    """
+    notes = []
+    layout = SMPL_LAYOUTS[track.pose.shape[1]]
+    used = np.any(track.pose, axis=(0, 2))
+    lost = [n for n, u in zip(layout, used, strict=True) if u and n not in body.joint_names]
+    if lost:
+        shown = ", ".join(lost[:4]) + (", ..." if len(lost) > 4 else "")
+        notes.append(f"the body lacks {shown}; their rotations stay as they are")
+    count = len(track.pose)
+    shape = np.zeros((count, body.num_shape), np.float32)
+    if track.shape is not None and embedded:
+        notes.append("shape is in SMPL's components; the embedded body's mean shape is taken")
+    elif track.shape is not None:
+        given = np.broadcast_to(track.shape, (count, track.shape.shape[-1]))
+        width = min(given.shape[1], body.num_shape)
+        shape[:, :width] = given[:, :width]
+        if given[:, width:].any():
+            notes.append(f"shape components after the body's {body.num_shape} are left out")
+    place = np.zeros((count, 3)) if track.translation is None else track.translation
+    pose = np.asarray(body.pose_from_smpl(track.pose.astype(np.float32)))
+    return Posed(pose, shape, place.astype(np.float32), tuple(notes))
+
+
+def in_track(
+    track: Track,
+    body: BodyModel,
+    before: Float[np.ndarray, "T J 3"],
+    after: Float[np.ndarray, "T J 3"],
+) -> Float[np.ndarray, "T K 3"]:
+    """The track's own pose with the rotations that changed on the body; all others to the bit."""
+    pose = track.pose.copy()
+    for joint, name in enumerate(SMPL_LAYOUTS[pose.shape[1]]):
+        if name in body.joint_names:
+            k = body.joint_names.index(name)
+            changed = (before[:, k] != after[:, k]).any(axis=1)
+            pose[changed, joint] = after[changed, k]
+    return pose
+
+
+def up_of(pose: Float[np.ndarray, "T J 3"]) -> tuple[float, float, float]:
+    """The axis, of six, along which the trunk points most in all: that is up.
+
+    AMASS has z up, most others y, and poses of cameras y down; no file says which.
+    """
+    turns = np.asarray(matrix_from_axis_angle(pose[:, 0]))
+    mean = turns[:, :, 1].mean(axis=0)
+    axis = int(np.argmax(np.abs(mean)))
+    up = [0.0, 0.0, 0.0]
+    up[axis] = 1.0 if mean[axis] >= 0 else -1.0
+    return up[0], up[1], up[2]
+
+
+@eqx.filter_jit
+def _vertices(body: BodyModel, pose: Any, shape: Any, translation: Any) -> Any:
+    return body(pose, shape, translation).vertices
+
+
+def skins(body: BodyModel, posed: Posed) -> Iterator[Float[np.ndarray, "N V 3"]]:
+    """The vertices of all frames, at most `BATCH` frames at a time."""
+    count = len(posed.pose)
+    for start in range(0, count, BATCH):
+        at = np.minimum(np.arange(start, start + BATCH), count - 1)
+        found = _vertices(body, posed.pose[at], posed.shape[at], posed.translation[at])
+        yield np.asarray(found)[: count - start]
+
+
+def second_differences(body: BodyModel, posed: Posed) -> tuple[float, float]:
+    """How rough a motion is: mean and largest second difference of its vertices, in metres."""
+    total, largest, count = 0.0, 0.0, 0
+    last = np.zeros((0, body.num_vertices, 3), np.float32)
+    for batch in skins(body, posed):
+        frames = np.concatenate([last, batch])
+        last = frames[-2:]
+        if len(frames) > 2:
+            size = np.linalg.norm(np.diff(frames, n=2, axis=0), axis=-1)
+            total, count = total + float(size.sum(dtype=np.float64)), count + size.size
+            largest = max(largest, float(size.max()))
+    return (total / count if count else 0.0), largest
+
+
+def displacements(body: BodyModel, before: Posed, after: Posed) -> tuple[float, float]:
+    """Mean and largest distance by which vertices were moved, in metres."""
+    total, largest, count = 0.0, 0.0, 0
+    for one, other in zip(skins(body, before), skins(body, after), strict=True):
+        size = np.linalg.norm(other - one, axis=-1)
+        total, count = total + float(size.sum(dtype=np.float64)), count + size.size
+        largest = max(largest, float(size.max()))
+    return total / count, largest
