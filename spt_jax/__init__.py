@@ -6,6 +6,7 @@ import typing
 from spt_jax._lazy import lazy_names as _lazy_names
 
 if typing.TYPE_CHECKING:
+    from spt_jax import datasets as datasets
     from spt_jax import fit as fit
     from spt_jax import io as io
     from spt_jax import keypoints as keypoints
@@ -157,6 +158,7 @@ __getattr__, __dir__ = _lazy_names(
         "untangle_motion": "spt_jax.untangle.motion",
         "untangle_pose": "spt_jax.untangle.pose",
         # The namespaces.
+        "datasets": "",
         "fit": "",
         "io": "",
         "keypoints": "",

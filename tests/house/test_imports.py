@@ -30,6 +30,7 @@ FLOORS = (
     "fit",
     "untangle",
     "show",
+    "datasets",
     "view",
     "cli",
 )

@@ -129,6 +129,17 @@ def test_everything_public_is_documented():
 
 
 NAMESPACES = {
+    "datasets": [
+        "Finished",
+        "Progress",
+        "Resources",
+        "Summary",
+        "Task",
+        "UnknownFileError",
+        "clean",
+        "measure",
+        "run",
+    ],
     "fit": [
         "BodySpheres",
         "FitResult",
