@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spt_jax.datasets.work import UnknownFileError
+from spt_jax.datasets.items.work import UnknownFileError
 
 
 class Upper:

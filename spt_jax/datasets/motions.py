@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from spt_jax.datasets.figures import file_figures, overlap_figures, worst_frame
+from spt_jax.datasets.items.work import Report, UnknownFileError
 from spt_jax.datasets.run import run
 from spt_jax.datasets.summary import Summary
-from spt_jax.datasets.work import Report, UnknownFileError
 from spt_jax.io.poses.reading import SUFFIXES, UnknownStructureError, open_poses
 from spt_jax.metrics import MotionOverlap, motion_overlap
 
 if TYPE_CHECKING:
     from spt_jax.body import BodyModel
-    from spt_jax.datasets.inventory import Inventory
-    from spt_jax.datasets.store import Store
+    from spt_jax.datasets.items.inventory import Inventory
+    from spt_jax.datasets.items.store import Store
     from spt_jax.io.poses.track import MotionFile, Track
     from spt_jax.rest.surface import RestSurface
 
@@ -360,7 +360,7 @@ def _body_key(body: str) -> str:
     """The body's name, or the hash of its file: where it lies does not matter."""
     if body == "anny":
         return body
-    from spt_jax.datasets.store import sha256
+    from spt_jax.datasets.items.store import sha256
     from spt_jax.files.limits import as_file
 
     return f"sha256:{sha256(as_file(body, 'body model'))}"

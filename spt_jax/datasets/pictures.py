@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spt_jax.datasets.inventory import Item
-from spt_jax.datasets.store import Store
+from spt_jax.datasets.items.inventory import Item
+from spt_jax.datasets.items.store import Store
 from spt_jax.files.outputs import atomic_write, ensure_folder
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from spt_jax.datasets.figures import DEPTH_EDGES, VOLUME_EDGES, file_figures
+from spt_jax.datasets.items.store import Store
 from spt_jax.datasets.pictures import picture_of, worst
-from spt_jax.datasets.store import Store
 from spt_jax.datasets.summary import Summary, figures_of
 
 Row = Mapping[str, Any]

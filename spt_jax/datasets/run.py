@@ -7,13 +7,13 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from spt_jax.datasets.engines import Finished, Progress
 from spt_jax.datasets.engines.cluster import Resources, cluster
+from spt_jax.datasets.engines.events import Finished, Progress
 from spt_jax.datasets.engines.local import local
-from spt_jax.datasets.inventory import Item, as_shard, take_inventory
-from spt_jax.datasets.store import Store
+from spt_jax.datasets.items.inventory import Item, as_shard, take_inventory
+from spt_jax.datasets.items.store import Store
+from spt_jax.datasets.items.work import Task, is_whole, usable_cores
 from spt_jax.datasets.summary import Summary, write_results
-from spt_jax.datasets.work import Task, is_whole, usable_cores
 
 Engine = Literal["local", "ray"]
 OnEvent = Callable[[Finished | Progress], None]

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from spt_jax.datasets.inventory import Inventory
-from spt_jax.datasets.store import Store
-from spt_jax.datasets.work import Task
+from spt_jax.datasets.items.inventory import Inventory
+from spt_jax.datasets.items.store import Store
+from spt_jax.datasets.items.work import Task
 from spt_jax.files.outputs import atomic_write, write_json
 
 # Of these, neither sum nor mean says anything.

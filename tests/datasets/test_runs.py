@@ -15,9 +15,9 @@ import pytest
 from helpers_datasets import Upper, check_results, texts
 
 from spt_jax.datasets import Finished, run
-from spt_jax.datasets import store as stores
-from spt_jax.datasets.inventory import as_shard
-from spt_jax.datasets.store import Store
+from spt_jax.datasets.items import store as stores
+from spt_jax.datasets.items.inventory import as_shard
+from spt_jax.datasets.items.store import Store
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

@@ -14,7 +14,7 @@ FILES = {
         ".__init__"
     ): path
     for path in PACKAGE.rglob("*.py")
-    if "data" not in path.parts
+    if "data" not in path.relative_to(PACKAGE).parts
 }
 
 # Whoever is below must not import whoever stands above it.

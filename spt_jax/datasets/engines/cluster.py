@@ -12,10 +12,10 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from spt_jax.datasets.engines import Finished, Progress, StartError
-from spt_jax.datasets.inventory import Item
-from spt_jax.datasets.store import Store
-from spt_jax.datasets.work import RoomError, Task, lost, work
+from spt_jax.datasets.engines.events import Finished, Progress, StartError
+from spt_jax.datasets.items.inventory import Item
+from spt_jax.datasets.items.store import Store
+from spt_jax.datasets.items.work import RoomError, Task, lost, work
 
 
 class Resources(NamedTuple):

@@ -14,11 +14,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
-from spt_jax.datasets.engines import Finished, Progress, StartError
+from spt_jax.datasets.engines.events import Finished, Progress, StartError
 from spt_jax.datasets.engines.messages import receive, send
-from spt_jax.datasets.inventory import Item
-from spt_jax.datasets.store import Store
-from spt_jax.datasets.work import RoomError, Task, lost, work
+from spt_jax.datasets.items.inventory import Item
+from spt_jax.datasets.items.store import Store
+from spt_jax.datasets.items.work import RoomError, Task, lost, work
 
 # How often a file is given to another process after one has ended at it.
 _TRIES = 3

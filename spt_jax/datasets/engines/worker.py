@@ -14,9 +14,9 @@ from queue import SimpleQueue
 from typing import Any
 
 from spt_jax.datasets.engines.messages import receive, send
-from spt_jax.datasets.inventory import Item
-from spt_jax.datasets.store import Store
-from spt_jax.datasets.work import RoomError, Task, work
+from spt_jax.datasets.items.inventory import Item
+from spt_jax.datasets.items.store import Store
+from spt_jax.datasets.items.work import RoomError, Task, work
 
 
 def serve() -> None:

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from spt_jax.datasets.inventory import Item
-from spt_jax.datasets.store import Store, outputs_in, place_of
+from spt_jax.datasets.items.inventory import Item
+from spt_jax.datasets.items.store import Store, outputs_in, place_of
 
 # What writing meets where nothing can be written any more: the next file would fare no better.
 _FULL = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from spt_jax.datasets.store import Store
+from spt_jax.datasets.items.store import Store
 
 
 class Item(NamedTuple):

@@ -1,0 +1,1 @@
+"""The files of a data set: found, claimed, worked on, and what is done of them kept."""
