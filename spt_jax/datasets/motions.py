@@ -166,7 +166,7 @@ class CleanMotions(MeasureMotions):
         )
         from spt_jax.untangle.motion import MotionStep, untangle_motion
 
-        body = self.body_model
+        body = self._writable(track)
         posed = on_body(track, body, embedded=self.body == "anny")
         up = up_of(posed.pose)
 
@@ -209,6 +209,21 @@ class CleanMotions(MeasureMotions):
             "frame_rate": track.frame_rate,
         }
         return found, in_track(track, body, posed.pose, after.pose), posed.notes
+
+    def _writable(self, track: "Track") -> "BodyModel":
+        """The body with the joints that can be written: those that the file has a place for."""
+        from spt_jax.body.poses import SMPL_LAYOUTS
+        from spt_jax.datasets.restricted import restricted
+
+        layout = SMPL_LAYOUTS[track.pose.shape[1]]
+        known = range(len(layout))
+        if self.structure == "input" and track.blocks:
+            known = sorted({joint for block in track.blocks for joint in block.joints})
+        names = tuple(layout[k] for k in known)
+        bodies: dict[tuple[str, ...], BodyModel] = self.__dict__.setdefault("_bodies", {})
+        if names not in bodies:
+            bodies[names] = restricted(self.body_model, names)
+        return bodies[names]
 
     def _write(self, file: "MotionFile", poses: dict[str, np.ndarray], out: Path) -> list[str]:
         if self.structure == "input":

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -46,7 +47,9 @@ def on_body(track: Track, body: BodyModel, *, embedded: bool) -> Posed:
     lost = [n for n, u in zip(layout, used, strict=True) if u and n not in body.joint_names]
     if lost:
         shown = ", ".join(lost[:4]) + (", ..." if len(lost) > 4 else "")
-        notes.append(f"the body lacks {shown}; their rotations stay as they are")
+        notes.append(f"rotations of {shown} stay as they are, which the body does not have")
+    if track.left_hand is not None or track.right_hand is not None:
+        notes.append("components of hands stay as they are; fingers are taken at rest")
     count = len(track.pose)
     shape = np.zeros((count, body.num_shape), np.float32)
     if track.shape is not None and embedded:
@@ -83,7 +86,7 @@ def up_of(pose: Float[np.ndarray, "T J 3"]) -> tuple[float, float, float]:
 
     AMASS has z up, most others y, and poses of cameras y down; no file says which.
     """
-    turns = np.asarray(matrix_from_axis_angle(pose[:, 0]))
+    turns = np.asarray(matrix_from_axis_angle(jnp.asarray(pose[:, 0])))
     mean = turns[:, :, 1].mean(axis=0)
     axis = int(np.argmax(np.abs(mean)))
     up = [0.0, 0.0, 0.0]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from spt_jax.datasets.items.store import Store
+from spt_jax.datasets.items.store import RESERVED, Store
 
 
 class Item(NamedTuple):
@@ -54,6 +54,8 @@ def take_inventory(folder: Path, out: Path, wanted: Callable[[Path], bool]) -> I
     items, others, examples = [], Counter(), {}
     for path in _files(folder, out.resolve()):
         name = path.relative_to(folder).as_posix()
+        if name in RESERVED and (folder / Store.FOLDER).exists():
+            continue  # of the run that wrote this folder
         if path.name.startswith(".") or not wanted(path):
             kind = "hidden" if path.name.startswith(".") else path.suffix.lower() or "no suffix"
             others[kind] += 1

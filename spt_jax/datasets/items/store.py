@@ -34,6 +34,9 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
+RESERVED = ("manifest.jsonl", "manifest.csv", "people.csv", "summary.json", "report.html")
+"""What a run itself writes into the folder of the results."""
+
 _WHOLE = 0  # the byte that stands for all of it
 _NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 

@@ -13,13 +13,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from spt_jax.datasets.items.inventory import Item
-from spt_jax.datasets.items.store import Store, outputs_in, place_of
+from spt_jax.datasets.items.store import RESERVED, Store, outputs_in, place_of
 
 # What writing meets where nothing can be written any more: the next file would fare no better.
 _FULL = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
-
-RESERVED = ("manifest.jsonl", "manifest.csv", "people.csv", "summary.json", "report.html")
-"""What a run itself writes into the folder of the results."""
 
 # Called with what is done of a file, of how much, and what is done now.
 Report = Callable[[int, int, str], None]
