@@ -12,7 +12,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.datasets.items.work import UnknownFileError as UnknownFileError
     from spt_jax.datasets.motions import clean as clean
     from spt_jax.datasets.motions import measure as measure
-    from spt_jax.datasets.run import run as run
+    from spt_jax.datasets.runs import run as run
     from spt_jax.datasets.summary import Summary as Summary
 
 __all__ = [
@@ -35,7 +35,7 @@ __getattr__, __dir__ = _lazy_names(
         "Resources": "spt_jax.datasets.engines.cluster",
         "clean": "spt_jax.datasets.motions",
         "measure": "spt_jax.datasets.motions",
-        "run": "spt_jax.datasets.run",
+        "run": "spt_jax.datasets.runs",
         "Summary": "spt_jax.datasets.summary",
         "Task": "spt_jax.datasets.items.work",
         "UnknownFileError": "spt_jax.datasets.items.work",

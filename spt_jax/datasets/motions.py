@@ -10,7 +10,7 @@ import numpy as np
 
 from spt_jax.datasets.figures import file_figures, overlap_figures, worst_frame
 from spt_jax.datasets.items.work import Report, UnknownFileError
-from spt_jax.datasets.run import run
+from spt_jax.datasets.runs import run
 from spt_jax.datasets.summary import Summary
 from spt_jax.io.poses.reading import SUFFIXES, UnknownStructureError, open_poses
 from spt_jax.metrics import MotionOverlap, motion_overlap
