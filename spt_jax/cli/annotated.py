@@ -1,8 +1,8 @@
 """The people of a keypoint file, each with an image and a camera, for `spt-jax fit`."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,6 +104,54 @@ def gather(
             )
         )
     return gathered, notes
+
+
+def as_map(text: str | None) -> dict[str, str] | None:
+    """What `--map left_wrist=lpaw,nose=snout` says.
+
+    Raises:
+        ValueError: it says something else.
+    """
+    if text is None:
+        return None
+    pairs = [tuple(side.strip() for side in item.split("=")) for item in text.split(",")]
+    for pair in pairs:
+        if len(pair) != 2 or not all(pair):
+            raise ValueError(
+                f"map must be such as left_wrist=lpaw,nose=snout: got {'='.join(pair)!r} in "
+                f"{text!r}."
+            )
+    if len({own for own, _ in pairs}) < len(pairs):
+        raise ValueError(f"map must say each name once: got {text!r}.")
+    return {pair[0]: pair[1] for pair in pairs}
+
+
+def of_the_body(
+    people: Sequence[Annotated], placed: Mapping[str, tuple[bool, ...] | None]
+) -> tuple[list[Annotated], list[str]]:
+    """The people without the points that lie nowhere on the body, and a note where there are any.
+
+    Args:
+        people: those gathered.
+        placed: of each layout, whether each of its points lies on the body; None where all do.
+
+    Raises:
+        ValueError: somebody has no other points.
+    """
+    kept, lost = [], 0
+    for one in people:
+        there = placed[one.person.layout]
+        trust = one.person.confidence
+        if there is not None:
+            trust = np.where(np.array(there), trust, 0.0)
+            lost += int(np.sum((trust == 0) & (one.person.confidence > 0)))
+            if not trust.any():
+                raise ValueError(
+                    f"the body must have what is seen of {one.name}: got points of fingers alone, "
+                    "on a body without; choose another --body, or other --people."
+                )
+        kept.append(replace(one, person=one.person._replace(confidence=trust)))
+    return kept, [f"points of fingers, which the body has not: {lost}"] if lost else []
 
 
 def read_camera(path: Path, *, max_bytes: int | None = None) -> "PinholeCamera":

@@ -4,7 +4,7 @@ import json as json_format
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import tyro
 
@@ -28,6 +28,7 @@ def fit(
     keypoints: tyro.conf.Positional[Path],
     out: Path = Path("fitted"),
     layout: str | None = None,
+    names: Annotated[str | None, tyro.conf.arg(name="map")] = None,
     camera: Path | None = None,
     focal: float | None = None,
     center: tuple[float, float] | None = None,
@@ -47,7 +48,7 @@ def fit(
     """Find the 3D poses of the people in a file of 2D keypoints.
 
     Takes COCO's annotations and results, what MMPose, AlphaPose, Detectron2, Ultralytics and
-    OpenPose write as JSON, and JSON or .npz files of this project
+    OpenPose write as JSON, DeepLabCut's tables, and JSON or .npz files of this project
     ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
     .glb of each person coloured by label, a picture of each image with the bodies over it, and
     report.json. The exit code is 1 if somebody could not be fitted, or if what was found lies
@@ -57,8 +58,10 @@ def fit(
     Args:
         keypoints: the file, .json or .npz.
         out: folder for the results, made where missing.
-        layout: the order of the keypoints, such as coco17, body25, h36m17 or smpl24; what the file
-            says if not given.
+        layout: the order of the keypoints, such as coco17, body25_hands, wholebody133, mpii16 or
+            smpl24, or their names with commas between them; what the file says if not given.
+        names: what keypoints of the file are whose names are not known, such as
+            left_wrist=lpaw,nose=snout.
         camera: a .json or .npz file with a 3 x 4 matrix, or with focal and center. Without it and
             the next two, one that spans 55 degrees over the image's longer side.
         focal: focal length in pixels.
@@ -89,13 +92,13 @@ def fit(
             f"robust must be a positive number of pixels, auto or off: got {robust}."
         )
     from spt_jax._exclusions import as_fold_distance
-    from spt_jax.cli.annotated import gather
+    from spt_jax.cli.annotated import as_map, gather, of_the_body
     from spt_jax.files.outputs import ensure_folder, write_json
     from spt_jax.keypoints import keypoint_regressor, read_keypoints
 
     with user_errors():
         as_fold_distance(fold_distance)
-        file = read_keypoints(keypoints, layout=layout, max_bytes=max_bytes)
+        file = read_keypoints(keypoints, layout=layout, map=as_map(names), max_bytes=max_bytes)
         chosen, notes = gather(
             keypoints,
             file,
@@ -123,10 +126,13 @@ def fit(
         from spt_jax.cli.unfinished import UnfinishedRun, manifest_of
 
         with user_errors():
-            groups = scenes_of(chosen) if together else [[one] for one in chosen]
             model = load_body(body, max_bytes=max_bytes)
-            for order in {one.person.layout for one in chosen}:
-                keypoint_regressor(model, order)
+            orders = {one.person.layout for one in chosen}
+            chosen, lost = of_the_body(
+                chosen, {order: keypoint_regressor(model, order).placed for order in orders}
+            )
+            notes += lost
+            groups = scenes_of(chosen) if together else [[one] for one in chosen]
             folder = ensure_folder(out)
         if any(one.camera_source == "estimated" for one in chosen):
             notes.append(
@@ -156,6 +162,7 @@ def fit(
                 settings = {
                     "keypoints": str(keypoints),
                     "layout": layout,
+                    "map": names,
                     "people": people,
                     "body": body,
                     **options,

@@ -156,7 +156,10 @@ def prepare_fit(
     # A search starts from the middle of what is likely: a T-pose is far from any that people take.
     middle = (likely or pose_prior(body.joint_names)).middle()
     first = (middle if start.pose is None else start.pose, start.shape, start.translation)
-    people, batch = as_people(body, points, trust, first, terms.expected_error, terms.robust)
+    placed = figure.regressor.placed
+    people, batch = as_people(
+        body, points, trust, first, terms.expected_error, terms.robust, placed=placed
+    )
     return setup, people, batch
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from spt_jax.keypoints.confidences import shown
-from spt_jax.keypoints.layouts import LAYOUTS, Layout, as_layout
+from spt_jax.keypoints.layout import Layout
+from spt_jax.keypoints.layouts import LAYOUTS, as_layout
 
 #: Confidence of a point that COCO's annotators marked as hidden (v = 1): they guessed its place.
 OCCLUDED = 0.5
@@ -17,9 +18,9 @@ _FARTHEST = 1e6
 # AlphaPose gives up to 6, and the logits of MMPose's SimCC heads reach 10
 # (https://github.com/open-mmlab/mmpose/issues/2939). Percent would all become 1.
 _SUREST = 20.0
-# Layouts that begin with COCO's 17 points: feet; Halpe's head, neck, hip and feet; both again with
-# face and hands (COCO-WholeBody, Halpe's full body).
-_LONGER_THAN_COCO = (23, 26, 133, 136)
+# What lists of so many points are where nothing says so: COCO's 17 points and feet; Halpe's head,
+# neck, hip and feet; both again with face and hands. All begin with COCO's 17.
+_LONGER_THAN_COCO = {23: "coco23", 26: "halpe26", 133: "wholebody133", 136: "halpe136"}
 _CLIPPED = "confidences above 1, taken as 1"
 _COLUMNS = ("x", "y", "confidence")
 
@@ -30,7 +31,8 @@ class Person(NamedTuple):
     Attributes:
         points: in pixels from the top left; (0, 0) where missing.
         confidence: of each point, from 0, missing, to 1.
-        layout: the name of the keypoints' order, a key of `spt_jax.keypoints.LAYOUTS`.
+        layout: the name of the keypoints' order, a key of `spt_jax.keypoints.LAYOUTS`, or the
+            keypoints' names with commas between them.
         image: the image's file name, or its id where the file knows no more; or None.
         width, height: of that image in pixels, or None.
         id: the person's own id in the file, or None.
@@ -47,32 +49,56 @@ class Person(NamedTuple):
     score: float | None = None
 
 
+class Order(NamedTuple):
+    """What the keypoints of a list are.
+
+    Attributes:
+        layout: a key of LAYOUTS, "smpl", or names with commas between them.
+        rows: which points of the list are the layout's; None for all.
+        count: how many points the list has, where `rows` is given.
+    """
+
+    layout: str
+    rows: tuple[int, ...] | None = None
+    count: int = 0
+
+
 def choose_layout(
     where: str,
     flat: list[Any],
-    wanted: str | None,
+    order: Order | None,
     usual: tuple[str, ...],
     remarks: Counter[str],
 ) -> tuple[Layout, list[Any]]:
     """The layout asked for, or the one of the format's own that has so many keypoints.
 
     Returns:
-        The layout, and the numbers of its points: of a longer list that begins with COCO's 17,
-        these, and what is left out is counted in `remarks`.
+        The layout, and the numbers of its points. What is left out is counted in `remarks`: of a
+        longer list that begins with COCO's 17, where those were asked for, all but these.
 
     Raises:
         ValueError: it has another count, or the format has none of that count.
     """
     count = len(flat) // 3
-    if count in _LONGER_THAN_COCO and (wanted == "coco17" or (not wanted and "coco17" in usual)):
+    if order is not None and order.layout == "coco17" and count in _LONGER_THAN_COCO:
         kept = len(LAYOUTS["coco17"].names)
         remarks["points of feet, face, hands and such after COCO's 17, which are not used"] += (
             count - kept
         )
         return LAYOUTS["coco17"], flat[: 3 * kept]
-    if wanted is not None:
+    if order is None and "coco17" in usual and count in _LONGER_THAN_COCO:
+        order = Order(_LONGER_THAN_COCO[count])
+    if order is not None:
+        if order.rows is not None:
+            if count != order.count:
+                raise ValueError(
+                    f"{where} must have a point for each of the {order.count} names in the file: "
+                    f"got {count}."
+                )
+            flat = [number for k in order.rows for number in flat[3 * k : 3 * k + 3]]
+            count = len(order.rows)
         try:
-            return as_layout(wanted, count), flat
+            return as_layout(order.layout, count), flat
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from error
     for name in usual:
@@ -80,8 +106,10 @@ def choose_layout(
             return LAYOUTS[name], flat
     counts = " or ".join(f"{len(LAYOUTS[name].names)} ({name})" for name in usual)
     rule = f"must have {counts} keypoints" if usual else "needs a layout, which the file lacks"
+    fitting = [name for name, layout in LAYOUTS.items() if len(layout.names) == count]
     raise ValueError(
-        f"{where} {rule}: got {count}; name the layout that it has, one of {', '.join(LAYOUTS)}."
+        f"{where} {rule}: got {count}; name the layout that it has, one of "
+        f"{', '.join(fitting or LAYOUTS)}."
     )
 
 
@@ -137,6 +165,10 @@ def as_points(
         if found.any():
             remarks[what] += int(found.sum())
     confidence = np.where(lost, 0.0, np.minimum(confidence, 1.0))
+    nowhere = (confidence > 0) & np.array([point == "" for point in layout.points])
+    if nowhere.any():
+        remarks["points of the face, which are not used"] += int(nowhere.sum())
+        confidence = np.where(nowhere, 0.0, confidence)
     return np.where(confidence[:, None] > 0, rows[:, :2], 0.0), confidence
 
 

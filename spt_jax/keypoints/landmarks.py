@@ -27,6 +27,16 @@ _OFFICIAL = {
     },
 }
 
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+#: The ends of the fingers, of bodies that have fingers.
+FINGERTIPS = tuple(f"{side}_{finger}_tip" for side in ("left", "right") for finger in _FINGERS)
+
+# As _OFFICIAL, in the order of FINGERTIPS.
+_OFFICIAL_TIPS = {
+    6890: (2746, 2319, 2445, 2556, 2673, 6191, 5782, 5905, 6016, 6133),
+    10475: (5361, 4933, 5058, 5169, 5286, 8079, 7669, 7794, 7905, 8022),
+}
+
 # The eyes' height above the tip of the nose, per distance from there to the top of the head, and
 # their distance from the middle, per half of the head's width over the ears. So they lie on the
 # embedded body; people's are 63 mm apart on a width of 185 mm, 0.34 too.
@@ -79,6 +89,49 @@ def find_landmarks(body: BodyModel) -> dict[str, int]:
         found |= _of_the_foot(body, vertices, side, outward)
     found |= _OFFICIAL.get(len(vertices), {})
     return {name: found[name] for name in LANDMARKS}
+
+
+def find_fingertips(body: BodyModel) -> dict[str, int]:
+    """The vertices at the ends of the fingers that a body has.
+
+    SMPL-H's and SMPL-X's are official, known by their numbers of vertices. On any other body it is
+    the vertex farthest from a finger's last joint, in the direction that the finger points at rest,
+    among those that the joint moves.
+
+    Args:
+        body: the body; its template, joints and skinning weights are read.
+
+    Returns:
+        A vertex index for those of FINGERTIPS whose finger has its last two joints; none for SMPL.
+
+    Raises:
+        TypeError: inside jit, grad or vmap of a function that the body is an argument of.
+
+    Example:
+        >>> from spt_jax.body import load_body
+        >>> from spt_jax.keypoints.landmarks import find_fingertips
+        >>> len(find_fingertips(load_body()))
+        10
+    """
+    if isinstance(body.template, Tracer) or isinstance(body.weights, Tracer):
+        raise TypeError(
+            "body must be known: got a traced body; find its fingertips outside jit, grad and vmap."
+        )
+    vertices, found = np.asarray(body.template, np.float64), {}
+    official = dict(zip(FINGERTIPS, _OFFICIAL_TIPS.get(len(vertices), ()), strict=False))
+    for tip in FINGERTIPS:
+        before, last = (tip.replace("_tip", number) for number in ("2", "3"))
+        if before not in body.joint_names or last not in body.joint_names:
+            continue
+        at = [
+            np.asarray(body.joint_template)[body.joint_names.index(name)] for name in (before, last)
+        ]
+        rows = np.flatnonzero(np.asarray(body.weights)[:, body.joint_names.index(last)] > 0.5)
+        if tip in official:
+            found[tip] = official[tip]
+        elif rows.size:
+            found[tip] = int(rows[np.argmax((vertices[rows] - at[1]) @ (at[1] - at[0]))])
+    return found
 
 
 def _of_the_head(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> dict[str, int]:

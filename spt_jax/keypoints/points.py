@@ -26,6 +26,7 @@ COMBINATIONS: dict[str, str] = {
     "right_wide_hip": "as left_wide_hip",
     "mid_spine": "on the chain pelvis, spine1, spine2, spine3, half-way from the hips up to the "
     "shoulders at rest",
+    "upper_neck": "half-way between the joints of neck and head",
     "mid_face": "half-way between the head joint and the nose",
     "left_hand": "in the middle of the first knuckles of index, middle, ring and pinky, where no "
     "joint is so named",
@@ -71,6 +72,8 @@ def weights_of(body: BodyModel, point: str) -> dict[str, float]:
         return {f"{side}_hip": (1 + spread) / 2, f"{other}_hip": (1 - spread) / 2}
     if point == "mid_spine":
         return _mid_spine(body)
+    if point == "upper_neck":
+        return {"neck": 0.5, "head": 0.5}
     if point == "mid_face":
         return {"head": 0.5, "nose": 0.5}
     if point in ("left_hand", "right_hand"):

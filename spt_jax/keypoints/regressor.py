@@ -1,5 +1,6 @@
 """Keypoints of a body: a fixed linear map from its joints and a few of its vertices."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -13,7 +14,8 @@ from jaxtyping import Array, Float
 from scipy.sparse import sparray, spmatrix
 
 from spt_jax.body import BodyModel, PosedBody
-from spt_jax.keypoints.landmarks import LANDMARKS, find_landmarks
+from spt_jax.body.poses import FINGERS
+from spt_jax.keypoints.landmarks import FINGERTIPS, LANDMARKS, find_fingertips, find_landmarks
 from spt_jax.keypoints.layouts import as_layout
 from spt_jax.keypoints.points import COMBINATIONS, needs_landmarks, weights_of
 
@@ -32,6 +34,9 @@ class KeypointRegressor(eqx.Module):
         vertices: the vertices of the body that are used. Static.
         joint_weights: of each joint in each keypoint.
         vertex_weights: of each of `vertices` in each keypoint.
+        placed: whether each keypoint lies anywhere on the body. Points of the face do not, nor do
+            those of fingers on a body without: their rows are the head's or the root joint, and
+            fits leave them out. None where all do. Static.
 
     Raises:
         TypeError: weights that are not floating-point.
@@ -54,8 +59,14 @@ class KeypointRegressor(eqx.Module):
     vertices: tuple[int, ...] = eqx.field(static=True)
     joint_weights: Float[Array, "K J"]
     vertex_weights: Float[Array, "K L"]
+    placed: tuple[bool, ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
+        if self.placed is not None and len(self.placed) != len(self.names):
+            raise ValueError(
+                f"placed must be given for each of the {len(self.names)} names: got "
+                f"{len(self.placed)}."
+            )
         counts = {"joint_weights": None, "vertex_weights": len(self.vertices)}
         for name, columns in counts.items():
             array = getattr(self, name)
@@ -173,8 +184,9 @@ def keypoint_regressor(
         body: the body; for landmarks its template and weights are read.
         layout: what each keypoint is; one of
 
-            - "coco17", "body25", "openpose18", "h36m17", "smpl22", "smpl24", "smpl52", "smpl55",
-              or "smpl" with a `count`;
+            - a key of `spt_jax.keypoints.LAYOUTS`, such as "coco17", "body25_hands", "wholebody133"
+              or "smpl24"; "smpl" with a `count`; names with commas between them, in any data set's
+              words;
             - a sequence of names: joints of the body, landmarks, or COMBINATIONS;
             - a sequence of whole numbers: joints of the body;
             - a dense regressor as SMPL's users have them: (K, V) from the vertices, of which those
@@ -214,7 +226,14 @@ def keypoint_regressor(
             )
     elif isinstance(layout, str):
         known = as_layout(layout, count)
-        made = _from_names(body, known.names, known.points, known.name, surface=known.surface)
+        made = _from_names(
+            body,
+            known.names,
+            known.points,
+            known.name,
+            surface=known.surface,
+            whole=not known.surface,
+        )
     elif _is_sequence_of(layout, str):
         made = _from_names(body, tuple(given), tuple(given), "layout", surface=False)
     elif _is_sequence_of(layout, (int, np.integer)) or _is_row_of_indices(layout):
@@ -261,14 +280,34 @@ def _from_indices(body: BodyModel, indices: list[int]) -> KeypointRegressor:
 
 
 def _from_names(
-    body: BodyModel, names: tuple[str, ...], points: tuple[str, ...], what: str, *, surface: bool
+    body: BodyModel,
+    names: tuple[str, ...],
+    points: tuple[str, ...],
+    what: str,
+    *,
+    surface: bool,
+    whole: bool = True,
 ) -> KeypointRegressor:
-    """`surface`: "left_eye" is the vertex also where the body, SMPL-X, has a joint of that name."""
+    """The regressor of points by name.
+
+    `surface`: "left_eye" is the vertex also where the body, SMPL-X, has a joint of that name.
+    `whole`: whether fingers that the body lacks, and points of the face, are an error.
+    """
     own = set(body.joint_names)
     landmarks = find_landmarks(body) if needs_landmarks(points, own, surface) else {}
     if not surface:
         landmarks = {name: vertex for name, vertex in landmarks.items() if name not in own}
-    rows = [weights_of(body, point) for point in points]
+    if any(point in FINGERTIPS for point in points):
+        landmarks |= find_fingertips(body)
+    placed = tuple(
+        whole or point in own or point in landmarks or not (point == "" or _is_of_a_finger(point))
+        for point in points
+    )
+    anywhere = "head" if "head" in own else body.joint_names[0]
+    rows = [
+        weights_of(body, point) if there else {anywhere: 1.0}
+        for point, there in zip(points, placed, strict=True)
+    ]
     missing = [
         name
         for name, row in zip(names, rows, strict=True)
@@ -281,7 +320,12 @@ def _from_names(
             f"{', '.join(body.joint_names)}, and all have {', '.join((*LANDMARKS, *COMBINATIONS))}."
             " List those that you have."
         )
-    return _assemble(body, names, rows, landmarks)
+    made = _assemble(body, names, rows, landmarks)
+    return made if all(placed) else dataclasses.replace(made, placed=placed)
+
+
+def _is_of_a_finger(point: str) -> bool:
+    return point in FINGERTIPS or point in FINGERS
 
 
 def _assemble(

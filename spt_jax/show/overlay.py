@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from spt_jax._camera import PinholeCamera
 from spt_jax.files.limits import TooLargeError, as_file, check_bytes, file_errors
 from spt_jax.io.mesh_files import as_mesh_arrays
-from spt_jax.keypoints.layouts import Layout
+from spt_jax.keypoints.layout import Layout
 from spt_jax.show.look import BACKGROUND, LIGHTS, MATERIAL, Picture, check_png, finished
 from spt_jax.show.offscreen import import_extra, offscreen_plotter
 from spt_jax.show.panel import vertex_normals

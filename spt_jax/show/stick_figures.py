@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from spt_jax.keypoints.layouts import Layout, as_layout, edge_side, side
+from spt_jax.keypoints.layout import Layout, edge_side, side
+from spt_jax.keypoints.layouts import as_layout
 from spt_jax.show.look import CURVES, INK, PAPER, blank_figure, drawn
 
 # Okabe and Ito's blue and orange are told apart by all kinds of colour vision.

@@ -469,12 +469,44 @@ def test_what_a_file_has_and_is_not_used_is_said(calls, tmp_path, rng, monkeypat
     one = {"keypoints": points.tolist(), "keypoint_scores": [0.5] * 16 + [0.04] + [0.9] * 116}
     (tmp_path / "a.json").write_text(json.dumps([one]))
     assert main(["fit", str(tmp_path / "a.json"), "--out", str(tmp_path / "out")]) == 0
-    said = "points of feet, face, hands and such after COCO's 17, which are not used: 116"
+    said = "points of the face, which are not used: 68"
     assert said in " ".join(capsys.readouterr().err.split())
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert any(said in note for note in report["notes"])
     # All scores reach the fit: the stand-in sums them.
-    assert report["people"][0]["terms"]["total"] == pytest.approx(16 * 0.5 + 0.04)
+    assert report["people"][0]["terms"]["total"] == pytest.approx(16 * 0.5 + 0.04 + 48 * 0.9)
+
+
+def test_what_the_body_has_not_is_said_and_names_are_mapped(
+    calls, tmp_path, rng, monkeypatch, capsys
+):
+    """A body of 24 joints has no fingers."""
+    without_pictures(monkeypatch)
+    monkeypatch.setattr("spt_jax._report.intersection_report", no_overlap)
+    names = ["paw", "left_elbow", "left_index1", "right_ring_tip", "left_knee"]
+    points = rng.uniform(50, 400, (5, 2)).round(1).tolist()
+    content = {"names": names, "people": [points], "width": 640, "height": 480}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.uint32)
+    np.savez(tmp_path / "body.npz", **synthetic_smpl(rng, joints=24) | {"f": faces})
+    words = ["fit", str(tmp_path / "a.json"), "--body", str(tmp_path / "body.npz")]
+    words += ["--out", str(tmp_path / "out"), "--map", "right_wrist=paw"]
+    assert main(words) == 0
+    err = " ".join(capsys.readouterr().err.split())
+    assert "points of fingers, which the body has not: 2" in err
+    (call,) = calls
+    assert call["layout"] == "right_wrist,left_elbow,left_index1,right_ring_tip,left_knee"
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["people"][0]["points_seen"] == 3
+    assert report["settings"]["map"] == "right_wrist=paw"
+    assert main([*words[:-1], "right_wrist"]) == 2
+    assert "map must be such as left_wrist=lpaw" in capsys.readouterr().err
+    assert main([*words[:-1], "left_index1=paw,left_index1=left_knee"]) == 2
+    assert "map must say each name once" in capsys.readouterr().err
+    content |= {"names": names[2:4], "people": [points[:2]]}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    assert main([*words[:-2]]) == 2
+    assert "got points of fingers alone, on a body without" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("width", [72, 80, 120])

@@ -15,10 +15,11 @@ from helpers_fit import camera, frames, objective, seen
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from spt_jax import RESULTS, PinholeCamera, fit_pose, intersection_report
+from spt_jax import RESULTS, PinholeCamera, fit_pose, intersection_report, keypoint_regressor
 from spt_jax._status import names_of
 from spt_jax.fit import (
     Regularizer,
+    Search,
     SelfIntersection,
     Stages,
     Start,
@@ -26,6 +27,7 @@ from spt_jax.fit import (
     Variables,
     as_regularizer,
 )
+from spt_jax.fit.setup import prepare_fit
 from spt_jax.fit.stages import descend, total_cost
 from spt_jax.keypoints import Person
 
@@ -347,3 +349,47 @@ def test_what_a_callback_raises_ends_the_fit(people, plain):
 
     with pytest.raises(KeyboardInterrupt, match="0"):
         fit(people[2][0], on_step=stop)
+
+
+@pytest.mark.slow
+def test_hands_are_fitted_where_their_points_are_given():
+    """A fist: without its points the fingers stay as they were."""
+    body = embedded_body()
+    pose = frames("walk/0010")[0]
+    fist = [
+        k for k, name in enumerate(body.joint_names) if name[-1] in "123" and "spine" not in name
+    ]
+    fist = [k for k in fist if "thumb" not in body.joint_names[k]]
+    turn = jnp.array([0.0, 0.0, 1.0])[None]
+    sides = jnp.array([-1.0 if "left" in body.joint_names[k] else 1.0 for k in fist])[:, None]
+    pose = pose.at[np.array(fist)].set(sides * turn)
+    points = np.asarray(seen(pose, layout="body25_hands"))
+    trust = np.ones(67, np.float32)
+    people = [
+        Person(points, np.where(np.arange(67) < count, trust, 0), "body25_hands")
+        for count in (67, 25)
+    ]
+    found = fit_pose(body, people, camera(), regularizer="none", terms=Terms(expected_error=2.0))
+    off = np.linalg.norm(np.asarray(found.keypoints) - points, axis=-1)
+    assert off[0].max() < 12 and np.median(off[0, 25:]) < 2
+    bend = np.asarray(found.pose)[:, np.array(fist), 2] * np.asarray(sides)[:, 0]
+    assert np.median(bend[0]) > 0.5 and np.abs(np.median(bend[1])) < 0.3
+    # Points that lie nowhere on the body are left out, whatever they are.
+    whole = "wholebody133"
+    face = np.full((133, 2), 7.0, np.float32)
+    regressor = keypoint_regressor(body, whole)
+    assert regressor.placed is not None and sum(regressor.placed) == 65
+    setup = prepare_fit(
+        body,
+        face,
+        camera(),
+        layout=whole,
+        confidence=None,
+        start=Start(),
+        terms=Terms(),
+        regularizer="none",
+        search=Search(),
+        stages=Stages(),
+    )
+    np.testing.assert_array_equal(setup[1].confidence[0], regressor.placed)
+    assert setup[0].search.figure.moving == tuple(range(52))

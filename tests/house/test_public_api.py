@@ -71,7 +71,7 @@ PARAMETERS = {
     " terms=Terms(), regularizer='spt', search=Search(), stages=Stages(),"
     " scene=Scene(weights=(0.01, 0.1, 1.0, 10.0, 100.0)), on_step=None",
     "keypoint_regressor": "body, layout, *, count=None, names=None",
-    "read_keypoints": "path, *, layout=None, max_bytes=None",
+    "read_keypoints": "path, *, layout=None, map=None, max_bytes=None",
     "load_body": "source='anny', *, num_shape=10, num_expression=10, dtype=None, max_bytes=None",
     "load_mocap": "",
     "untangle_motion": "body, poses, *, shape=None, translation=None, frames_per_second=30.0,"

@@ -19,10 +19,10 @@ from spt_jax.keypoints import (
     keypoint_regressor,
 )
 from spt_jax.keypoints.landmarks import LANDMARKS
-from spt_jax.keypoints.layouts import side
+from spt_jax.keypoints.layout import side
 from spt_jax.keypoints.points import COMBINATIONS
 
-_REAL = ["coco17", "body25", "openpose18", "h36m17"]
+_REAL = [name for name in LAYOUTS if not name.startswith("smpl")]
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +64,17 @@ def test_layouts_are_whole_and_symmetric(name):
     layout = LAYOUTS[name]
     count = len(layout.names)
     assert len(set(layout.names)) == len(layout.official) == len(layout.points) == count
+    assert {end for edge in layout.edges for end in edge} == {
+        k for k, point in enumerate(layout.points) if point
+    }
+    if name in ("left_hand21", "right_hand21"):
+        mirrored = tuple(_mirrored(keypoint) for keypoint in LAYOUTS["left_hand21"].names)
+        assert mirrored == LAYOUTS["right_hand21"].names
+        return
     assert {_mirrored(keypoint) for keypoint in layout.names} == set(layout.names)
     pairs = {frozenset(layout.names[end] for end in edge) for edge in layout.edges}
     assert len(pairs) == len(layout.edges)
     assert {frozenset(map(_mirrored, pair)) for pair in pairs} == pairs
-    assert {end for edge in layout.edges for end in edge} == set(range(count))
     sides = [edge_side(layout, edge) for edge in layout.edges]
     assert sides.count("left") == sides.count("right") > 3
 
@@ -77,8 +83,27 @@ def test_layouts_have_their_published_sizes_and_orders():
     sizes = {name: len(layout.names) for name, layout in LAYOUTS.items()}
     assert sizes == {
         **{"coco17": 17, "body25": 25, "openpose18": 18, "h36m17": 17},
+        **{"mpii16": 16, "aic14": 14, "crowdpose14": 14, "posetrack17": 17, "jhmdb15": 15},
         **{"smpl22": 22, "smpl24": 24, "smpl52": 52, "smpl55": 55},
+        **{"coco23": 23, "wholebody133": 133, "halpe26": 26, "halpe136": 136, "mediapipe33": 33},
+        **{"humanart21": 21, "body25_hands": 67, "openpose18_hands": 60},
+        **{"left_hand21": 21, "right_hand21": 21},
     }
+    # Each list stands in the documentation of its data set, with numbers.
+    for layout, numbered in {
+        "wholebody133": {17: "left_big_toe", 22: "right_heel", 91: "left_hand_root"}
+        | {95: "left_thumb_tip", 112: "right_hand_root", 132: "right_pinky_tip"},
+        "halpe26": {17: "head_top", 18: "neck", 19: "pelvis", 21: "right_big_toe"},
+        "halpe136": {25: "right_heel", 94: "left_hand_root", 135: "right_pinky_tip"},
+        "mediapipe33": {2: "left_eye", 8: "right_ear", 16: "right_wrist", 19: "left_index1"}
+        | {22: "right_thumb2", 24: "right_hip", 29: "left_heel", 32: "right_big_toe"},
+        "body25_hands": {24: "right_heel", 25: "left_hand_root", 66: "right_pinky_tip"},
+        "mpii16": {0: "right_ankle", 8: "upper_neck", 15: "left_wrist"},
+        "aic14": {2: "right_wrist", 12: "head_top"},
+        "crowdpose14": {4: "left_wrist", 12: "head_top"},
+        "posetrack17": {1: "upper_neck", 4: "right_ear", 16: "right_ankle"},
+    }.items():
+        assert {k: as_layout(layout).names[k] for k in numbered} == numbered
     assert as_layout("coco17").names[9] == "left_wrist"
     assert as_layout("body25").names[4] == as_layout("openpose18").names[4] == "right_wrist"
     assert as_layout("body25").official[24] == "RHeel"
@@ -89,7 +114,8 @@ def test_layouts_have_their_published_sizes_and_orders():
 
 
 def test_smpl_edges_are_the_bodies_own_tree():
-    for joints, parents in PARENTS.items():
+    for joints in SMPL_LAYOUTS.keys() & PARENTS:
+        parents = PARENTS[joints]
         edges = LAYOUTS[f"smpl{joints}"].edges
         assert [parent for parent, _ in edges] == parents[1:]
 
@@ -145,6 +171,21 @@ def test_layouts_lie_on_the_body_as_a_person_does(body, name):
     regressor = keypoint_regressor(body, name, count=len(LAYOUTS[name].names))
     assert regressor.names == LAYOUTS[name].names
     at = _at_rest(body, regressor)
+    if regressor.placed is not None:
+        lost = [name for name in at if not regressor.placed[regressor.names.index(name)]]
+        assert all(LAYOUTS[name].points[regressor.names.index(one)] == "" for one in lost)
+        at = {keypoint: point for keypoint, point in at.items() if keypoint not in lost}
+    for side_of in ("left", "right"):
+        if f"{side_of}_hand_root" in at:  # each finger goes on from knuckle to tip
+            for finger in ("index", "middle", "ring", "pinky", "thumb"):
+                ends = [f"{side_of}_{finger}{joint}" for joint in ("1", "2", "3", "_tip")]
+                chain = np.array([at[end] for end in ends])
+                bones = np.linalg.norm(np.diff(chain, axis=0), axis=1)
+                assert (bones > 0.01).all() and (bones < 0.06).all()
+                out = np.linalg.norm(chain - at[f"{side_of}_hand_root"], axis=1)
+                assert (np.diff(out) > 0).all()
+    if "hand21" in name:
+        return
     for keypoint, point in at.items():
         np.testing.assert_allclose(at[_mirrored(keypoint)], point * [-1, 1, 1], atol=1e-3)
         if side(keypoint) == "left":
@@ -155,7 +196,7 @@ def test_layouts_lie_on_the_body_as_a_person_does(body, name):
     assert at["left_wrist"][0] > at["left_elbow"][0] > at["left_shoulder"][0]
     assert at["left_hip"][0] > np.asarray(body.joint_template)[1, 0]
     assert 0.55 < at["left_hip"][0] / at["left_shoulder"][0] < 0.8
-    if "nose" in at:
+    if {"nose", "left_ear"} <= set(at):
         assert at["nose"][2] > at["left_ear"][2] + 0.05
     shoulders = (at["left_shoulder"] + at["right_shoulder"]) / 2
     for middle in {"neck", "thorax"} & set(at):

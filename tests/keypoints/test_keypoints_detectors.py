@@ -140,13 +140,14 @@ def test_frames_and_scores_of_people_are_kept(tmp_path):
     names = {str(k): name for k, name in enumerate(["root", "right_hip"])}
     demo = _mmpose_demo() | {"meta_info": {"keypoint_id2name": names}}
     assert len(_read(tmp_path, demo).people) == 2  # the caller says what they are
-    with pytest.raises(ValueError, match=r"known order: got \['root', 'right_hip'\] for MMPose"):
+    with pytest.raises(ValueError, match=r"a point for each of the 2 names in the file: got 17"):
         _read(tmp_path, demo, layout=None)
     assert _read(tmp_path, _mmpose_demo(), layout=None).people[0].layout == "coco17"
     assert _read(tmp_path, _tensorflow(), layout=None).people[0].layout == "coco17"
     turned = [{"keypoints": person["keypoints"][::-1]} for person in _tensorflow()]
-    with pytest.raises(ValueError, match=r"known order: got .*'right_ankle', .* for person 0 in"):
-        _read(tmp_path, turned, layout=None)
+    again = _read(tmp_path, turned, layout=None).people
+    assert again[0].layout == ",".join(COCO[::-1])
+    np.testing.assert_array_equal(again[0].points, _POINTS[0][::-1])
 
 
 def _renamed(node, new):
@@ -245,31 +246,59 @@ def test_what_becomes_of_odd_points_is_noted(tmp_path):
 
 
 @pytest.mark.parametrize("count", [23, 26, 133, 136])
-def test_whole_bodies_are_read_by_their_first_17_points(count, tmp_path, rng):
+def test_whole_bodies_are_read_as_such_or_by_their_first_17_points(count, tmp_path, rng):
     points = rng.uniform(5, 500, (count, 2))
     content = [{"keypoints": points.tolist(), "keypoint_scores": [0.5] * count}]
-    for layout in (None, "coco17"):
-        file = _read(tmp_path, content, layout=layout)
-        np.testing.assert_array_equal(file.people[0].points, points[:17])
-        (note,) = file.notes
-        assert note.startswith("points of feet, face, hands") and note.endswith(f"{count - 17}")
+    file = _read(tmp_path, content, layout="coco17")
+    np.testing.assert_array_equal(file.people[0].points, points[:17])
+    (note,) = file.notes
+    assert note.startswith("points of feet, face, hands") and note.endswith(f"{count - 17}")
+    file = _read(tmp_path, content, layout=None)
+    face = np.array([point == "" for point in LAYOUTS[file.people[0].layout].points])
+    assert face.sum() == (68 if count > 100 else 0)
+    np.testing.assert_array_equal(file.people[0].confidence, np.where(face, 0, 0.5))
+    np.testing.assert_array_equal(file.people[0].points[~face], points[~face])
+    assert file.notes == (("points of the face, which are not used: 68",) if count > 100 else ())
     with pytest.raises(ValueError, match=f"body25 has 25 keypoints: got {count}"):
         _read(tmp_path, content, layout="body25")
 
 
-def test_points_of_hands_faces_and_feet_are_said_not_to_be_used(tmp_path):
+def test_hands_and_feet_beside_a_body_are_read_and_faces_said_not_to_be_used(tmp_path):
     flat = [10.0, 20.0, 0.5] * 25
     person = {"pose_keypoints_2d": flat, "face_keypoints_2d": [3.0, 4.0, 0.5] * 70}
     person |= {"hand_left_keypoints_2d": [0] * 63, "hand_right_keypoints_2d": [1, 2, 0.5] * 21}
-    file = _read(tmp_path, {"people": [person, {"hand_left_keypoints_2d": [1, 2, 3]}]}, layout=None)
+    bare = {"pose_keypoints_2d": flat}
+    content = {"people": [person, {"hand_left_keypoints_2d": [1, 2, 3]}, bare]}
+    file = _read(tmp_path, content, layout=None)
     assert file.notes == (
         "points in face_keypoints_2d, which are not used: 70",
-        "points in hand_right_keypoints_2d, which are not used: 21",
         "points in hand_left_keypoints_2d, which are not used: 1",
     )
+    # Everybody of a file has one layout.
+    assert [one.layout for one in file.people] == ["body25_hands"] * 2
+    np.testing.assert_array_equal(file.people[0].confidence, [0.5] * 25 + [0] * 21 + [0.5] * 21)
+    assert file.people[0].points[46:].tolist() == [[1, 2]] * 21
+    np.testing.assert_array_equal(file.people[1].confidence, [0.5] * 25 + [0] * 42)
+    file = _read(tmp_path, content, layout="body25")
+    assert file.notes[1] == "points in hand_right_keypoints_2d, which are not used: 21"
+    with pytest.raises(
+        ValueError, match=r"hand_right_keypoints_2d of person 0 .*21 points: got 20"
+    ):
+        _read(
+            tmp_path,
+            {"people": [person | {"hand_right_keypoints_2d": [1, 2, 0.5] * 20}]},
+            layout=None,
+        )
     wholebody = {"keypoints": [5, 6, 2] * 17, "foot_kpts": [5, 6, 2] * 6, "face_kpts": [0] * 204}
     file = _read(tmp_path, {"annotations": [wholebody]})
     assert file.notes == ("points in foot_kpts, which are not used: 6",)
+    wholebody |= {"lefthand_kpts": [7, 8, 1.0] * 21, "face_kpts": [5, 6, 2] * 68}
+    file = _read(tmp_path, {"annotations": [wholebody, {"keypoints": [5, 6, 2] * 17}]}, layout=None)
+    assert file.notes == ("points of the face, which are not used: 68",)
+    assert [one.layout for one in file.people] == ["wholebody133"] * 2
+    trust = [1.0] * 23 + [0] * 68 + [0.5] * 21 + [0] * 21
+    np.testing.assert_array_equal(file.people[0].confidence, trust)
+    np.testing.assert_array_equal(file.people[1].confidence, [1.0] * 17 + [0] * 116)
 
 
 def _shares(size, low=0.1, high=0.9, **more):

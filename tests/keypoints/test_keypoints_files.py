@@ -93,7 +93,9 @@ def test_categories_may_list_another_known_order(tmp_path, rng):
     content = _coco([_annotation(flat)], categories=[{"id": 1, "keypoints": names}])
     assert read_keypoints(_written(tmp_path, content)).people[0].layout == "h36m17"
     content["categories"][0]["keypoints"] = names[::-1]
-    with pytest.raises(ValueError, match="list its keypoints in a known order"):
+    assert read_keypoints(_written(tmp_path, content)).people[0].layout == ",".join(names[::-1])
+    content["categories"][0]["keypoints"] = [f"point {k}" for k in range(17)]
+    with pytest.raises(ValueError, match=r"must name keypoints that are known: got .*'point 0'"):
         read_keypoints(_written(tmp_path, content))
     person = read_keypoints(_written(tmp_path, content), layout="coco17").people[0]
     assert person.layout == "coco17"

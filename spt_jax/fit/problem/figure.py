@@ -82,8 +82,10 @@ def make_figure(body: BodyModel, regressor: KeypointRegressor) -> Figure:
     """
     vertices = np.array(regressor.vertices, np.int32)
     skin = np.asarray(body.weights)[vertices]
-    weight = np.abs(np.asarray(regressor.joint_weights)).sum(axis=0)
-    weight = weight + np.abs(np.asarray(regressor.vertex_weights)).sum(axis=0) @ skin
+    # Rows that lie nowhere on the body are left out of fits.
+    rows = slice(None) if regressor.placed is None else np.array(regressor.placed)
+    weight = np.abs(np.asarray(regressor.joint_weights)[rows]).sum(axis=0)
+    weight = weight + np.abs(np.asarray(regressor.vertex_weights)[rows]).sum(axis=0) @ skin
     seen = weight > _LEAST_WEIGHT
     seen[0] = True
     for joint in range(len(body.parents) - 1, 0, -1):
@@ -117,5 +119,6 @@ def make_figure(body: BodyModel, regressor: KeypointRegressor) -> Figure:
         vertices=tuple(range(len(vertices))),
         joint_weights=regressor.joint_weights[:, moving],
         vertex_weights=regressor.vertex_weights,
+        placed=regressor.placed,
     )
     return Figure(smaller, points, tuple(int(joint) for joint in moving))

@@ -78,6 +78,8 @@ def as_people(
     start: tuple[Any, Any, Any],
     expected_error: Any,
     robust: Any,
+    *,
+    placed: tuple[bool, ...] | None = None,
 ) -> tuple[Person, tuple[int, ...]]:
     """All people of a call, in one leading axis, and the batch axes that they came with.
 
@@ -88,6 +90,7 @@ def as_people(
         start: pose; shape and translation as the user gave them, or None.
         expected_error: in pixels, one or one a person, or None for a share of the person's size.
         robust: Geman-McClure's scale in pixels, one or one a person, or None.
+        placed: whether each keypoint lies anywhere on the body; those that do not count as unseen.
 
     Raises:
         TypeError, ValueError: as `fit_pose`.
@@ -111,6 +114,8 @@ def as_people(
                 f"{trust.shape}."
             )
         trust = _broadcast("confidence", trust, (*batch, count))
+    if placed is not None:
+        trust = trust * jnp.asarray(np.array(placed), trust.dtype).reshape(*[1] * len(batch), count)
     _check_values(points, trust)
     # What is not seen may hold anything; it must not reach a product, not even with zero.
     points = jnp.where(trust[..., None] > 0, points, 0.0).reshape(-1, count, 2)
