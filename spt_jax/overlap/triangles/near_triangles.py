@@ -113,6 +113,7 @@ class NearTriangles:
 
     def _still(self, left: Left) -> Pairs:
         """The same of what an earlier shape left to look at."""
+        self._limit(left.pairs.shape[1])
         found = [self._straddling(*left.pairs[:, part]) for part in pieces(left.pairs.shape[1], 1)]
         a, b = left.groups
         if len(a):
@@ -154,22 +155,26 @@ class NearTriangles:
     def _found(self, pairs, if_few_touch: bool):
         """The straddling ones, and those with a corner in the other's plane; None if given up."""
         found, near, seen = [], [], 0
-        layout, shape = self._boxes[:2]
-        most = _MOST_PAIRS + _MOST_PAIRS_EACH * len(layout.slot)
+        shape = self._boxes[1]
         for t, u in pairs:
             if if_few_touch and len(t) >= _MANY and touching_share(shape, t, u) > _TOUCHING:
                 return found, None
             t, u, in_plane = self._not_apart(t, u)
             near.append(in_plane)
             seen += len(t)
-            if seen > most:
-                raise Entangled(
-                    "vertices must be a surface whose triangles mostly lie apart: got more than "
-                    f"{most:,} pairs of {len(layout.slot):,} triangles that are near each other; "
-                    "look for coordinates that exploded or collapsed."
-                )
+            self._limit(seen)
             found.append(self._straddling(t, u))
         return found, near
+
+    def _limit(self, seen: int) -> None:
+        count = len(self.layout.slot)
+        most = _MOST_PAIRS + _MOST_PAIRS_EACH * count
+        if seen > most:
+            raise Entangled(
+                "vertices must be a surface whose triangles mostly lie apart: got more than "
+                f"{most:,} pairs of {count:,} triangles that are near each other; look for "
+                "coordinates that exploded or collapsed."
+            )
 
     def _not_apart(self, t, u):
         return not_apart(*self._boxes[:2], t, u, self._reach)
