@@ -14,6 +14,7 @@ from spt_jax._geometry import inflate
 from spt_jax._query import (
     as_backend,
     as_choice,
+    as_criterion,
     as_directions,
     as_faces,
     as_margin,
@@ -24,13 +25,14 @@ from spt_jax.bridge.bounded_jit import BoundedJit
 from spt_jax.bridge.callback import call_on_host, is_local
 from spt_jax.bridge.reverse_only import refuse_forward, with_slope
 from spt_jax.bridge.second_order import Products, product, with_hessian
+from spt_jax.overlap.criteria import Value
 from spt_jax.overlap.host_curvature import curvature_on_host, kept_on_host
 from spt_jax.overlap.host_functions import (
     PenaltyOptions,
     value_and_gradient_on_host,
     value_on_host,
 )
-from spt_jax.overlap.measure import Gradient, Rule, Sampling, Value
+from spt_jax.overlap.measure import Gradient, Rule, Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 from spt_jax.xla.backend import Program, Task, as_task, penalty_on_device
@@ -159,7 +161,7 @@ def self_intersection_penalty(
     faces = as_faces(faces, vertices.shape[-2])
     apart = as_margin(margin)
     options = PenaltyOptions(
-        as_choice("value", value, Value),
+        as_criterion(value, as_backend(backend) is not None),
         as_choice("gradient", gradient, Gradient),
         as_choice("rule", rule, Rule),
         Sampling(as_rays(rays), as_directions(directions)),

@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Integer
 
 from spt_jax._known import check_indices
+from spt_jax.overlap.criteria import CRITERIA
 from spt_jax.overlap.measure import Directions
 from spt_jax.overlap.rays.beam import Rays, orthogonal_directions
 from spt_jax.xla.settings import Xla
@@ -154,6 +155,20 @@ def as_choice(name: str, value: Any, choices: Any) -> Any:
     if not isinstance(value, str) or value not in allowed:
         listed = ", ".join(repr(choice) for choice in allowed)
         raise ValueError(f"{name} must be one of {listed}: got {value!r}.")
+    return value
+
+
+def as_criterion(value: Any, on_device: bool) -> str:
+    """The name of an overlap criterion.
+
+    Raises:
+        ValueError: any other value, or one that the device path does not have and is to.
+    """
+    names = [name for name, found in CRITERIA.items() if found.on_device or not on_device]
+    if not isinstance(value, str) or value not in names:
+        where = ' with backend="xla"' if on_device else ""
+        listed = ", ".join(map(repr, names))
+        raise ValueError(f"value must be one of {listed}{where}: got {value!r}.")
     return value
 
 

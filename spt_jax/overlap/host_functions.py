@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int8
 
 from spt_jax.overlap.convex import is_small_convex_solid
+from spt_jax.overlap.criteria import CRITERIA
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.inflation import Inflated
 from spt_jax.overlap.measure import (
@@ -19,7 +20,6 @@ from spt_jax.overlap.measure import (
     Rule,
     Sampling,
     Unmeasurable,
-    Value,
     check_usable,
     measure,
 )
@@ -38,7 +38,7 @@ class PenaltyOptions(NamedTuple):
         outwards: how far the surface is moved along its normals before it is measured.
     """
 
-    value: Value
+    value: str
     gradient: Gradient
     rule: Rule
     sampling: Sampling
@@ -85,7 +85,7 @@ def measured(
     vertices: Vertices, faces: Faces, options: PenaltyOptions, *, with_gradient: bool
 ) -> tuple[Float[np.ndarray, ""], Float[np.ndarray, "V 3"], Measurement | None]:
     """Value, gradient, and what was measured; None where there is no overlap, or no measure."""
-    nothing = np.zeros_like(vertices)
+    nothing, criterion = np.zeros_like(vertices), CRITERIA[options.value]
     moved = None
     try:
         check_usable(vertices, faces, options.rounding)
@@ -99,11 +99,12 @@ def measured(
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
         if faces.size == 0:
             return np.zeros(()), nothing, None
-        if options.value == "volume":
-            value = np.array(found.volume)
-        else:
-            value = np.array(np.mean(found.labels(options.rule) != 0))
-        gradient = found.gradient(options.gradient, options.rule) if with_gradient else nothing
+        value = np.array(criterion.of(found, options.rule), np.float64)
+        gradient = nothing
+        if with_gradient and criterion.slope is not None:
+            gradient = criterion.slope(found)
+        elif with_gradient:
+            gradient = found.gradient(options.gradient, options.rule)
         if moved is not None:
             gradient = moved.pulled_back(gradient)
     except Unmeasurable:
@@ -113,7 +114,7 @@ def measured(
     held = np.finfo(np.float32 if narrow else np.float64)
     if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
         return np.array(np.nan), nothing, None
-    if options.value == "volume" and value < held.tiny:
+    if criterion.power > 0 and value < held.tiny:
         # There is no overlap, but for rounding, or none that can be told from none: no slope.
         return np.zeros(()), nothing, None
     return value, gradient, found

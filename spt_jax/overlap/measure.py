@@ -21,7 +21,6 @@ from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
 from spt_jax.overlap.triangles.near_triangles import Entangled
 
 Directions = tuple[tuple[float, float, float], ...]
-Value = Literal["volume", "ratio"]
 Gradient = Literal["boundary", "vertex", "unit"]
 Rule = Literal["vertex", "triangle"]
 

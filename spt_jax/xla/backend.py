@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Integer
 
 from spt_jax.bridge.batches import as_more_meshes, over_batch
 from spt_jax.overlap.exclusions import NOTHING, Exclusions
-from spt_jax.overlap.measure import LEAST_EXTENT, Gradient, Rule, Sampling, Value
+from spt_jax.overlap.measure import LEAST_EXTENT, Gradient, Rule, Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.xla.gradient import as_labels, vertex_gradient
 from spt_jax.xla.measure import Wants, cast_beams, nothing_found
@@ -32,7 +32,7 @@ class Program(NamedTuple):
 
     settings: Xla
     rays: Rays
-    value: Value = "volume"
+    value: str = "volume"
     gradient: Gradient | None = None
     rule: Rule = "vertex"
 

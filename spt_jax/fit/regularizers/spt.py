@@ -11,10 +11,11 @@ from spt_jax._exclusions import as_fold_surface
 from spt_jax._geometry import inflate
 from spt_jax._groups import join_bodies
 from spt_jax._penalty import self_intersection_penalty
-from spt_jax._query import as_choice, as_directions, as_margin, as_rays
+from spt_jax._query import as_choice, as_criterion, as_directions, as_margin, as_rays
 from spt_jax.body import BodyModel
 from spt_jax.fit.problem.variables import Variables
 from spt_jax.fit.regularizers._base import Regularizer, as_weights
+from spt_jax.overlap.criteria import CRITERIA, Value
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 
@@ -62,7 +63,7 @@ class SelfIntersection(Regularizer):
     margin: float | Float[Array, ""] = eqx.field(
         default=0.0, converter=lambda given: given if isinstance(given, Array) else as_margin(given)
     )
-    value: Literal["volume", "ratio"] = eqx.field(static=True, default="volume")
+    value: Value = eqx.field(static=True, default="volume")
     gradient: Literal["boundary", "vertex", "unit"] = eqx.field(static=True, default="boundary")
     rule: Literal["vertex", "triangle"] = eqx.field(static=True, default="vertex")
     rays: Rays = eqx.field(static=True, default=None, converter=as_rays)
@@ -71,7 +72,7 @@ class SelfIntersection(Regularizer):
 
     def __check_init__(self):
         as_choice("folds", self.folds, Literal["ignore", "count"])
-        as_choice("value", self.value, Literal["volume", "ratio"])
+        as_criterion(self.value, on_device=False)
         as_choice("gradient", self.gradient, Literal["boundary", "vertex", "unit"])
         as_choice("rule", self.rule, Literal["vertex", "triangle"])
 
@@ -101,4 +102,5 @@ class SelfIntersection(Regularizer):
             margin=margin,
             rest_surface=self.rest_surface,
         )
-        return found / _CENTIMETER**3 if self.value == "volume" else found * 100
+        power = CRITERIA[self.value].power
+        return found / _CENTIMETER**power if power else found * 100
