@@ -1,12 +1,14 @@
 """Bodies of other packages, and plain functions, as bodies of this one."""
 
+import copy
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spt_jax.body.adapted import TURN, AdaptedBody
+from spt_jax.body.adapted import MATRICES, TURN, AdaptedBody
 from spt_jax.body.function_body import FunctionBody, body_of_function
 
 
@@ -67,6 +69,12 @@ def _of_model(model: Any) -> AdaptedBody:
         # A quad with a corner twice is a triangle.
         corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
     parents = tuple(int(parent) for parent in model.parents)
+    kind = getattr(getattr(model, "_config", None), "rotation_type", None)
+    if kind is not None and kind not in MATRICES:
+        # Axis angles of body-models have no derivative at zero, forwards not even where they are
+        # held fixed; its configuration says how rotations are written, and nothing else does.
+        model = copy.copy(model)
+        model._config = dataclasses.replace(model._config, rotation_type="rotmat")
     leaves, structure = jax.tree.flatten(model)
     return AdaptedBody(
         tuple(leaves),
@@ -76,6 +84,7 @@ def _of_model(model: Any) -> AdaptedBody:
         parents,
         tuple(map(str, model.joint_names)),
         _rows(model, parents),
+        kind,
     )
 
 
@@ -87,7 +96,7 @@ def _rows(model: Any, parents: tuple[int, ...]) -> tuple[tuple[str, int, str], .
     joints = dict(getattr(model, "pose_joint_indices", {}))
     found: list[tuple[int, str, int]] = []
     for number, (name, spec) in enumerate(poses.items()):
-        matrix = spec.rotation_type in ("rotmat", "matrix")
+        matrix = spec.rotation_type in MATRICES
         count = 1 if len(spec.dims) == (2 if matrix else 1) else spec.dims[0]
         own = joints.get(name, ())
         at = own if len(own) == count else [len(parents) * (1 + number)] * count

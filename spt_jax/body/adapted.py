@@ -14,12 +14,14 @@ from spt_jax.body import poses
 from spt_jax.body.base import AbstractBody, PosedBody, broadcast_batches, floating
 from spt_jax.body.fold_distances import fold_distances
 from spt_jax.body.model_check import checked_rows
+from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.rest.surface import RestSurface
 
 # Axis angles of body-models have no derivative at zero (version 0.26): a millionth of a radian in
 # place of none turns nothing that could be seen.
 _NO_TURN, _HARDLY = 1e-12, 1e-6
 
+MATRICES = ("rotmat", "matrix")
 TURN, _PLACE = "global_rotation", "global_translation"
 
 
@@ -39,6 +41,8 @@ class AdaptedBody(AbstractBody):
         parents, joint_names: the model's skeleton.
         rows: of each row of a pose which parameter it is, which of its rotations, and the name of
             the joint that it turns; None where the pose is no rotations.
+        kind: how the model that was given writes rotations; `model` takes matrices where it can,
+            whose derivatives are finite in either mode.
         only: which vertices are left; None for all.
     """
 
@@ -49,6 +53,7 @@ class AdaptedBody(AbstractBody):
     parents: tuple[int, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
     rows: tuple[tuple[str, int, str], ...] | None = eqx.field(static=True)
+    kind: str | None = eqx.field(static=True, default=None)
     only: Int[Array, "V"] | None = None
 
     @property
@@ -148,10 +153,16 @@ class AdaptedBody(AbstractBody):
         shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
         translation: Float[Array | np.ndarray, "*#batch 3"] | None = None,
     ) -> dict[str, Array]:
-        """The model's own arguments for a pose: `model.forward_vertices(**parameters)`.
+        """The given model's own arguments: `given.forward_vertices(**body.parameters(pose))`.
+
+        Rotations are written as the model that was given to `adapt` writes them.
 
         Args, Raises: as a call.
         """
+        return self.arguments(pose, shape, translation, self.kind)
+
+    def arguments(self, pose: Any, shape: Any, translation: Any, kind: str | None = None) -> Any:
+        """The arguments of `model`, or with rotations of another kind."""
         given = floating("pose", pose)
         own = self.pose_shape
         if given.ndim < len(own) or given.shape[given.ndim - len(own) :] != own:
@@ -179,7 +190,9 @@ class AdaptedBody(AbstractBody):
             found[name] = jnp.concatenate(parts, axis=-1)
             start += size
         given = jnp.broadcast_to(given, (*batch, *own))
-        return found | (self._numbers(given) if self.rows is None else self._turns(given))
+        if self.rows is None:
+            return found | self._numbers(given)
+        return found | self._turns(given, kind)
 
     def pose_of(self, parameters: Mapping[str, Any]) -> Float[Array, "..."]:
         """The pose that stands for the model's own arguments; what is missing is at rest.
@@ -197,14 +210,14 @@ class AdaptedBody(AbstractBody):
 
         rows = []
         for name, k, _ in self.rows:
-            spec = self._spec[name]
+            kind = self.kind or self._spec[name].rotation_type
             if name not in parameters:
                 rows.append(jnp.zeros(3))
                 continue
             value = floating(name, parameters[name])
-            value = value if self._is_single(name) else jnp.moveaxis(value, self._axis(name), 0)[k]
+            value = value if self._is_single(name) else jnp.moveaxis(value, _axis(kind), 0)[k]
             with _as_written():
-                rows.append(SO3.convert(value, src=spec.rotation_type, dst="axis_angle", xp=jnp))
+                rows.append(SO3.convert(value, src=kind, dst="axis_angle", xp=jnp))
         batch = jnp.broadcast_shapes(*(row.shape for row in rows))
         return jnp.stack([jnp.broadcast_to(row, batch) for row in rows], axis=-2)
 
@@ -224,6 +237,7 @@ class AdaptedBody(AbstractBody):
             self.parents,
             self.joint_names,
             self.rows,
+            self.kind,
             kept,
         )
 
@@ -241,10 +255,7 @@ class AdaptedBody(AbstractBody):
     def _is_single(self, name: str) -> bool:
         """Whether a parameter is one rotation, and no list of them."""
         spec = self._spec[name]
-        return len(spec.dims) == (2 if spec.rotation_type in ("rotmat", "matrix") else 1)
-
-    def _axis(self, name: str) -> int:
-        return -3 if self._spec[name].rotation_type in ("rotmat", "matrix") else -2
+        return len(spec.dims) == (2 if spec.rotation_type in MATRICES else 1)
 
     def _numbers(self, pose) -> dict[str, Array]:
         found, start = {}, 0
@@ -254,19 +265,19 @@ class AdaptedBody(AbstractBody):
         rest = jnp.zeros((*pose.shape[:-1], 3), pose.dtype)
         return found | {TURN: _as_rotation(rest, self._spec[TURN].rotation_type)}
 
-    def _turns(self, pose) -> dict[str, Array]:
+    def _turns(self, pose, kind: str | None) -> dict[str, Array]:
         rows: dict[str, list[tuple[int, int]]] = {}
         for row, (name, k, _) in enumerate(self.rows or ()):
             rows.setdefault(name, []).append((k, row))
         found = {}
         for name in (name for name, spec in self._spec.items() if spec.rotation_type is not None):
-            kind = self._spec[name].rotation_type
+            own = kind or self._spec[name].rotation_type
             if name not in rows:  # the model's root has a rotation of its own
-                found[name] = _as_rotation(jnp.zeros_like(pose[..., 0, :]), kind)
+                found[name] = _as_rotation(jnp.zeros_like(pose[..., 0, :]), own)
                 continue
             chosen = np.array([row for _, row in sorted(rows[name])])
-            turned = _as_rotation(pose[..., chosen, :], kind)
-            found[name] = jnp.squeeze(turned, self._axis(name)) if self._is_single(name) else turned
+            turned = _as_rotation(pose[..., chosen, :], own)
+            found[name] = jnp.squeeze(turned, _axis(own)) if self._is_single(name) else turned
         return found
 
 
@@ -281,10 +292,14 @@ def _parents_first(parents: tuple[int, ...]) -> list[int]:
     return sorted(range(len(parents)), key=lambda joint: (depth[joint], joint))
 
 
+def _axis(kind: str) -> int:
+    return -3 if kind in MATRICES else -2
+
+
 # Compiled as a whole: one by one the model's operations take half a minute the first time.
 @eqx.filter_jit
 def _posed(body: AdaptedBody, pose, shape, translation) -> PosedBody:
-    given = body.parameters(pose, shape, translation)
+    given = body.arguments(pose, shape, translation)
     with _as_written():
         vertices = body.model.forward_vertices(**given)
         skeleton = body.model.forward_skeleton(**given)
@@ -294,6 +309,8 @@ def _posed(body: AdaptedBody, pose, shape, translation) -> PosedBody:
 
 
 def _as_rotation(vectors: Float[Array, "*batch 3"], kind: str) -> Float[Array, "..."]:
+    if kind in MATRICES:
+        return matrix_from_axis_angle(vectors)
     from nanomanifold import SO3
 
     none = jnp.sum(vectors**2, axis=-1, keepdims=True) < _NO_TURN

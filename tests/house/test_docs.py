@@ -94,7 +94,7 @@ EXPECTED = {
     "recipes/own-body.md": the_worm_is_free,
     "recipes/smplx.md": prints("cm^3 of collisions", "intersecting pairs"),
     "recipes/body-models.md": prints(
-        "0 with adapt", "body_pose", "collision-free", "fit for the penalty", "after"
+        " with adapt", "body_pose", "collision-free", "fit for the penalty", "after"
     ),
     "recipes/rigs.md": prints("52 joints, ('Cartwheel',)", "0 after", "('Cartwheel untangled',)"),
     "recipes/pose-files.md": prints("walk (5, 22, 3) 120.0 female", "free of 52 joints"),
