@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse
 import trimesh
 
+from spt_jax.body import load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
 
 # Columns of kintree_table, root first, for SMPL, SMPL-H and SMPL-X.
@@ -122,8 +123,16 @@ def synthetic_smpl(rng, joints=24, vertices=60, components=10, features=None):
         "J_regressor": regressor / regressor.sum(axis=1, keepdims=True),
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "kintree_table": table,
-        "f": rng.integers(0, vertices, (2 * vertices, 3)).astype(np.uint32),
+        "f": bipyramid(vertices),
     }
+
+
+def bipyramid(vertices):
+    """The faces of a closed surface of so many vertices: a ring and two tips."""
+    ring = np.arange(vertices - 2)
+    after, above = np.roll(ring, -1), np.full(len(ring), vertices - 2)
+    faces = np.concatenate([[ring, after, above], [after, ring, above + 1]], axis=1)
+    return faces.T.astype(np.uint32)
 
 
 def synthetic_hand(rng, names=("",)):
@@ -234,5 +243,43 @@ def ball_arrays(subdivisions=1):
         "J_regressor": (owner == np.arange(24)[:, None]) / count,
         "weights": np.eye(24)[owner],
         "kintree_table": np.array([parents, range(24)]).astype(np.uint32),
+        "f": faces.astype(np.uint32),
+    }
+
+
+def smplx_like():
+    """The arrays of an SMPL-X file: a body with a hole in its mouth, and eyeballs in its head.
+
+    Of the embedded body: SMPL-X has eyeballs of 546 vertices each and a hole of 32 edges. The
+    regressor is the smallest one that gives the body's joints.
+    """
+    body = load_body(num_shape=2)
+    vertices, faces = np.asarray(body.template, np.float64), np.asarray(body.faces)
+    joints, names = np.asarray(body.joint_template, np.float64), SMPL_LAYOUTS[55]
+    head = joints[body.joint_names.index("head")]
+    front = vertices[np.asarray(body.weights).argmax(1) == body.joint_names.index("head"), 2].max()
+    mouth = np.array([0.0, head[1] + 0.015, front - 0.01])
+    away = np.linalg.norm((vertices[faces].mean(axis=1) - mouth) * [1.0, 2.0, 1.0], axis=1)
+    faces = faces[away > 0.02]
+    parts, weights = [vertices], np.zeros((len(vertices), 55))
+    weights[:, [names.index(name) for name in body.joint_names]] = np.asarray(body.weights)
+    weights = [weights]
+    where = {name: joints[k] for k, name in enumerate(body.joint_names)} | {"jaw": head}
+    for side, name in ((1, "left_eye"), (-1, "right_eye")):
+        eye = trimesh.creation.uv_sphere(radius=0.012, count=[18, 18])
+        center = np.array([0.03 * side, head[1] + 0.06, front - 0.035])
+        faces = np.concatenate([faces, eye.faces + sum(map(len, parts))])
+        parts.append(eye.vertices + center)
+        weights.append(np.tile(np.arange(55) == names.index(name), (len(eye.vertices), 1)))
+        where[name] = center
+    vertices = np.concatenate(parts)
+    equations = np.column_stack([vertices, np.ones(len(vertices))]).T
+    wanted = np.column_stack([np.array([where[name] for name in names]), np.ones(55)])
+    return {
+        "v_template": vertices,
+        "shapedirs": np.zeros((len(vertices), 3, 2)),
+        "J_regressor": wanted @ np.linalg.pinv(equations).T,
+        "weights": np.concatenate(weights),
+        "kintree_table": np.array([PARENTS[55], range(55)], np.int64).astype(np.uint32),
         "f": faces.astype(np.uint32),
     }

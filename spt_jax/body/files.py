@@ -2,6 +2,7 @@
 
 import io
 import os
+import warnings
 from importlib import resources
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import DTypeLike
 
+from spt_jax._mesh_check import check_mesh
 from spt_jax.body.family import ARRAYS, body_of
 from spt_jax.body.model import BodyModel
 from spt_jax.files.limits import as_file, file_errors, read_bytes, read_npz
 from spt_jax.files.pickles import dense_array, read_pickle
+from spt_jax.overlap.caps import holes_in_words
 
 
 def load_body(
@@ -93,7 +96,20 @@ def load_body(
         else:
             arrays, names = _read_pkl(path, max_bytes)
         body = body_of(arrays, names, path, num_shape, num_expression, kind)
+    _say_what_is_open(body, path)
     return body
+
+
+def _say_what_is_open(body: BodyModel, path: Path) -> None:
+    """Warn once of holes, which whatever measures overlap closes, or cannot close."""
+    found = check_mesh(np.asarray(body.template), np.asarray(body.faces))
+    if found.largest_hole is None or found.nonmanifold_edges:
+        return
+    holes = holes_in_words(found.holes, found.largest_hole, "m")
+    what = "which fans close wherever overlap is measured"
+    if found.open_sheets:
+        what = "too large for fans to close: its overlap cannot be measured"
+    warnings.warn(f"the surface of {path.name} has {holes}, {what}.", UserWarning, stacklevel=3)
 
 
 def _model_dtype(dtype: DTypeLike | None) -> np.dtype:

@@ -15,6 +15,7 @@ from spt_jax.cli.terminal import (
     progress_bar,
     show,
     user_errors,
+    warnings_as,
 )
 from spt_jax.fit.regularizers import regularizer_names
 
@@ -126,7 +127,8 @@ def fit(
         from spt_jax.cli.unfinished import UnfinishedRun, manifest_of
 
         with user_errors():
-            model = load_body(body, max_bytes=max_bytes)
+            with warnings_as(notes):
+                model = load_body(body, max_bytes=max_bytes)
             orders = {one.person.layout for one in chosen}
             chosen, lost = of_the_body(
                 chosen, {order: keypoint_regressor(model, order).placed for order in orders}

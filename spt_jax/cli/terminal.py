@@ -1,5 +1,6 @@
 """What the commands share towards the terminal: errors in one line, tables, progress."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -26,6 +27,15 @@ def user_errors() -> Iterator[None]:
         yield
     except (OSError, TypeError, ValueError) as error:
         raise CommandError(" ".join(str(error).split())) from error
+
+
+@contextmanager
+def warnings_as(notes: list[str]) -> Iterator[None]:
+    """Collect what is warned of as notes, one sentence each, without a place in the code."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    notes += [str(one.message).rstrip(".") for one in caught]
 
 
 @contextmanager

@@ -9,7 +9,14 @@ import tyro
 
 from spt_jax.cli.mesh import untangle_mesh_file
 from spt_jax.cli.rigs import untangle_rig_file
-from spt_jax.cli.terminal import err_console, out_console, progress_bar, show, user_errors
+from spt_jax.cli.terminal import (
+    err_console,
+    out_console,
+    progress_bar,
+    show,
+    user_errors,
+    warnings_as,
+)
 
 
 def untangle(
@@ -153,9 +160,11 @@ def untangle(
         )
         from spt_jax.cli.unfinished import UnfinishedRun, manifest_of
 
-        with user_errors():
+        said: list[str] = []
+        with user_errors(), warnings_as(said):
             model = load_body(body, num_shape=asked.num_shape, max_bytes=max_bytes)
         motion, notes = motion_of(asked, model, body)
+        notes = said + notes
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
         options = {

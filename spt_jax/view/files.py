@@ -3,6 +3,7 @@
 import re
 import secrets
 import tempfile
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -67,7 +68,10 @@ def open_file(
     """
     path = as_file(path)  # a pipe would be waited for
     if _is_model(path, max_bytes):
-        return Scene.of_body(load_body(path, max_bytes=max_bytes), name or path.stem)
+        with warnings.catch_warnings():  # of holes, which the scene's own notes say
+            warnings.simplefilter("ignore", UserWarning)
+            body = load_body(path, max_bytes=max_bytes)
+        return Scene.of_body(body, name or path.stem)
     if is_rig_file(path, max_bytes=max_bytes):
         return _rigged(path, name, max_bytes)
     if is_pose_file(path):

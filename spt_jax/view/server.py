@@ -248,7 +248,8 @@ class View:
             self._embedded = name is None
             motions = {} if scene.body is None else files.mocap_for(scene.body)
             if scene.body is not None and not self._embedded:
-                notes = check_mesh(np.asarray(scene.body.template), scene.faces).problems  # type: ignore
+                found = check_mesh(np.asarray(scene.body.template), scene.faces)  # type: ignore
+                notes = found.problems or found.warnings[: found.holes > 0]
             start = (_FIRST[0], motions[_FIRST[0]].names.index(_FIRST[1])) if motions else None
         if start is not None:
             motions[start[0]].load_into(scene, start[1])
