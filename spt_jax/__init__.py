@@ -31,6 +31,9 @@ if typing.TYPE_CHECKING:
     from spt_jax._report import intersection_report as intersection_report
     from spt_jax._result import Overlap as Overlap
     from spt_jax._settings import config as config
+    from spt_jax._sheets import SheetReport as SheetReport
+    from spt_jax._sheets import sheet_penalty as sheet_penalty
+    from spt_jax._sheets import sheet_report as sheet_report
     from spt_jax._status import RESULTS as RESULTS
     from spt_jax._steps import Step as Step
     from spt_jax.body import BodyModel as BodyModel
@@ -79,6 +82,7 @@ __all__ = [
     "RestSurface",
     "RigModel",
     "Scene",
+    "SheetReport",
     "Step",
     "UntangleMeshResult",
     "UntangleResult",
@@ -103,6 +107,8 @@ __all__ = [
     "paper_penalty",
     "read_keypoints",
     "self_intersection_penalty",
+    "sheet_penalty",
+    "sheet_report",
     "untangle_mesh",
     "untangle_motion",
     "untangle_pose",
@@ -138,6 +144,9 @@ __getattr__, __dir__ = _lazy_names(
         "RestSurface": "spt_jax.rest.surface",
         "Overlap": "spt_jax._result",
         "config": "spt_jax._settings",
+        "SheetReport": "spt_jax._sheets",
+        "sheet_penalty": "spt_jax._sheets",
+        "sheet_report": "spt_jax._sheets",
         "FitResult": "spt_jax.fit.result",
         "KeypointRegressor": "spt_jax.keypoints",
         "Penetration": "spt_jax.fit.people",

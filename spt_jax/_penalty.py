@@ -177,7 +177,7 @@ def self_intersection_penalty(
         options = options._replace(outwards=0.0)
         if isinstance(faces, Tracer):
             return _curved(options, None, vertices, faces)
-        return _curved(options, _Known(np.asarray(faces)), vertices, ())
+        return _curved(options, Known(np.asarray(faces)), vertices, ())
     if apart and device is not None:
         vertices = inflate(vertices, faces, apart / 2)
     vertices = refuse_forward(vertices)
@@ -187,8 +187,8 @@ def self_intersection_penalty(
         way = program, options.gradient
         return _on_device(way, vertices, jnp.asarray(faces), task.tables)
     if isinstance(faces, Tracer):
-        return _differentiable(options, None, vertices, faces)
-    return _differentiable(options, _Known(np.asarray(faces)), vertices, ())
+        return differentiable(options, None, vertices, faces)
+    return differentiable(options, Known(np.asarray(faces)), vertices, ())
 
 
 def paper_penalty(
@@ -240,14 +240,22 @@ def paper_penalty(
     )
 
 
-class _Known(NamedTuple):
+class Known(NamedTuple):
     """Faces whose values are known: no operand, and nothing to differentiate."""
 
     faces: np.ndarray
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _differentiable(options, known, vertices, traced):
+def differentiable(options, known, vertices, traced):
+    """What the host measures, for options of the penalty's or of a sheet's kind, with its gradient.
+
+    Args:
+        options: hashable, of `host_functions`.
+        known: the faces where their values are known; else None.
+        vertices: positions, with any batch axes.
+        traced: the faces where they are traced; else ().
+    """
     faces = traced if known is None else known.faces
     (value,) = call_on_host(value_on_host, options, (_scalar(vertices),), vertices, faces)
     return value
@@ -265,7 +273,7 @@ def _penalty_backward(options, known, gradient, cotangent):
     return _scaled(gradient, cotangent), None
 
 
-_differentiable.defvjp(_penalty_forward, _penalty_backward)
+differentiable.defvjp(_penalty_forward, _penalty_backward)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))

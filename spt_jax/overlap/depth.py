@@ -92,3 +92,32 @@ def _to_edges(points, start, end):
     square = np.einsum("ni,ni->n", along, along)
     part = np.einsum("ni,ni->n", way, along) / np.where(square > 0, square, 1.0)
     return np.linalg.norm(way - np.clip(part, 0, 1)[:, None] * along, axis=1)
+
+
+def nearest_points(
+    points: Float[np.ndarray, "N 3"], triangles: Float[np.ndarray, "M 3 3"]
+) -> tuple[Float[np.ndarray, "N"], Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    """From each point to the nearest triangle: how far, which, and the shares of its corners."""
+    distance, found = _nearest(points, triangles)
+    a, b, c = triangles[found].transpose(1, 0, 2)
+    ab, ac, ap = b - a, c - a, points - a
+    normal = np.cross(ab, ac)
+    square = np.einsum("ni,ni->n", normal, normal)
+    safe = np.where(square > 0, square, 1.0)
+    v = np.einsum("ni,ni->n", np.cross(ap, ac), normal) / safe
+    w = np.einsum("ni,ni->n", np.cross(ab, ap), normal) / safe
+    over = (square > 0) & (v >= 0) & (w >= 0) & (v + w <= 1)
+    shares = np.stack([1 - v - w, v, w], axis=1)
+    best = np.where(over, -1.0, np.inf)
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        p, q = triangles[found, start], triangles[found, end]
+        along = q - p
+        length = np.einsum("ni,ni->n", along, along)
+        part = np.einsum("ni,ni->n", points - p, along) / np.where(length > 0, length, 1.0)
+        part = np.clip(part, 0, 1)
+        away = np.linalg.norm(points - p - part[:, None] * along, axis=1)
+        nearer = np.flatnonzero(away < best)
+        best[nearer] = away[nearer]
+        shares[nearer] = 0.0
+        shares[nearer, start], shares[nearer, end] = 1 - part[nearer], part[nearer]
+    return distance, found, shares

@@ -5,7 +5,7 @@ them as well (`bridge/worker.py`): a worker that imports no JAX starts in a thir
 takes half of the memory.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Int8
@@ -23,7 +23,9 @@ from spt_jax.overlap.measure import (
     check_usable,
     measure,
 )
+from spt_jax.overlap.sheets import SheetInSolids
 
+SheetValue = Literal["area", "depth"]
 Vertices = Float[np.ndarray, "V 3"]
 Faces = Int[np.ndarray, "F 3"]
 
@@ -47,6 +49,20 @@ class PenaltyOptions(NamedTuple):
     outwards: float = 0.0
 
 
+class SheetOptions(NamedTuple):
+    """What a sheet beside solids is asked for.
+
+    Attributes:
+        value: as the argument of `sheet_penalty`.
+        solids: how many of the faces are the solids'; the sheet's follow.
+        rounding: machine epsilon of the vertices as the caller has them.
+    """
+
+    value: SheetValue
+    solids: int
+    rounding: float
+
+
 class LabelOptions(NamedTuple):
     """What the labels are asked for; see `PenaltyOptions`."""
 
@@ -57,16 +73,20 @@ class LabelOptions(NamedTuple):
 
 
 def value_on_host(
-    vertices: Vertices, faces: Faces, options: PenaltyOptions
+    vertices: Vertices, faces: Faces, options: PenaltyOptions | SheetOptions
 ) -> tuple[Float[np.ndarray, ""], ...]:
     """The penalty alone; NaN where the mesh cannot be measured."""
+    if isinstance(options, SheetOptions):
+        return _of_sheet(vertices, faces, options)[:1]
     return measured(vertices, faces, options, with_gradient=False)[:1]
 
 
 def value_and_gradient_on_host(
-    vertices: Vertices, faces: Faces, options: PenaltyOptions
+    vertices: Vertices, faces: Faces, options: PenaltyOptions | SheetOptions
 ) -> tuple[Float[np.ndarray, ""], Float[np.ndarray, "V 3"]]:
     """The penalty and its gradient; NaN and zeros where the mesh cannot be measured."""
+    if isinstance(options, SheetOptions):
+        return _of_sheet(vertices, faces, options)
     return measured(vertices, faces, options, with_gradient=True)[:2]
 
 
@@ -109,12 +129,28 @@ def measured(
             gradient = moved.pulled_back(gradient)
     except Unmeasurable:
         return np.array(np.nan), nothing, None
+    value, gradient = _as_held(value, gradient, options.rounding, least=criterion.power > 0)
+    known = np.isfinite(value) and (value > 0 or criterion.power <= 0)
+    return value, gradient, found if known else None
+
+
+def _of_sheet(vertices: Vertices, faces: Faces, options: SheetOptions):
+    try:
+        found = SheetInSolids(vertices, faces, options.solids, options.rounding)
+        value, gradient = found.area() if options.value == "area" else found.depth()
+    except Unmeasurable:
+        return np.array(np.nan), np.zeros_like(vertices)
+    return _as_held(np.array(value), gradient, options.rounding, least=True)
+
+
+def _as_held(value, gradient, rounding: float, *, least: bool):
+    """Value and gradient as the vertices' dtype can hold them, NaN and zeros where it cannot."""
     # Measured in float64: it may be more than the vertices' dtype can hold, or less.
-    narrow = options.rounding > np.finfo(np.float64).eps
+    narrow = rounding > np.finfo(np.float64).eps
     held = np.finfo(np.float32 if narrow else np.float64)
     if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
-        return np.array(np.nan), nothing, None
-    if criterion.power > 0 and value < held.tiny:
+        return np.array(np.nan), np.zeros_like(gradient)
+    if least and value < held.tiny:
         # There is no overlap, but for rounding, or none that can be told from none: no slope.
-        return np.zeros(()), nothing, None
-    return value, gradient, found
+        return np.zeros(()), np.zeros_like(gradient)
+    return value, gradient

@@ -59,6 +59,8 @@ def test_a_fit_ends_without_overlap(body):
     pose = body.pose_from_smpl(jnp.asarray(mocap().pose[mocap().names.index("punch/0013")]))
     regressor = keypoint_regressor(body, "smpl22")
     posed = body(pose)
-    keypoints = camera().project(regressor(posed.joints, posed.vertices[np.array(regressor.vertices, int)]))
+    keypoints = camera().project(
+        regressor(posed.joints, posed.vertices[np.array(regressor.vertices, int)])
+    )
     found = fit_pose(body, keypoints, camera(), layout="smpl22")
     assert found_in(body, found.vertices).is_free

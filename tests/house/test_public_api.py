@@ -26,6 +26,7 @@ NAMES = [
     "RestSurface",
     "RigModel",
     "Scene",
+    "SheetReport",
     "Step",
     "UntangleMeshResult",
     "UntangleResult",
@@ -49,12 +50,16 @@ NAMES = [
     "paper_penalty",
     "read_keypoints",
     "self_intersection_penalty",
+    "sheet_penalty",
+    "sheet_report",
     "untangle_mesh",
     "untangle_motion",
     "untangle_pose",
     "within_groups",
 ]
 PARAMETERS = {
+    "sheet_penalty": "vertices, faces, solid_vertices, solid_faces, *, value='area'",
+    "sheet_report": "vertices, faces, solid_vertices, solid_faces",
     "self_intersection_penalty": "vertices, faces, *, value='volume', gradient='boundary',"
     " rule='vertex', rays=None, directions=3, margin=0.0, face_groups=None, ignore_groups=(),"
     " rest_surface=None, backend='auto', second_order=False",

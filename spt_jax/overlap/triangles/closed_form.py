@@ -193,17 +193,23 @@ def _sides(topology: Topology, crossings: EdgeCrossings, ends: Ends, layer, foun
         begins[face, turn] = ends.of_ends(topology, there, end)[:, layer]
     sums = begins @ _SIDES
 
-    # Each edge that passes through a triangle is a side of two others.
-    number = np.tile(np.arange(len(crossings.face)), 2)
-    half = topology.halves[crossings.row].T.ravel()
-    kept = np.flatnonzero(half >= 0)
-    number, half = number[kept], half[kept]
+    number, half = sides_of(topology, crossings)
     jump = crossings.jump[number] * senses(topology, half)
     if times is not None:
         jump = jump * times[crossings.face[number]]
     at = _on_sides(topology, half, crossings.part[number])
     rest = _along(at, _CORNERS[(half % 3 + 2) % 3])
     return sums + summed(row[half // 3], jump[:, None] * rest, count)
+
+
+def sides_of(
+    topology: Topology, crossings: EdgeCrossings
+) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+    """Each edge that passes through a triangle is a side of two others: crossing, half-edge."""
+    number = np.tile(np.arange(len(crossings.face)), 2)
+    half = topology.halves[crossings.row].T.ravel()
+    kept = np.flatnonzero(half >= 0)
+    return number[kept], half[kept]
 
 
 def volumes_of(

@@ -144,9 +144,8 @@ def length_gradient(
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
     """The derivative of the weighted sum of the segments' lengths: vertices, and force on each.
 
-    Where edge pq passes through a triangle with the normal n, the place is p + t (q - p) =
-    alpha a + beta b + gamma c. A force f on it acts on the edge as f - h and on the triangle as h,
-    h = n f.(q - p) / n.(q - p), in these shares. A vertex that the two triangles share takes f.
+    Its ends pass their forces on by `force_on_crossings`; a vertex that the two triangles share
+    takes its own.
     """
     along = contours.point[:, 1] - contours.point[:, 0]
     length = np.sqrt(dot(along, along))
@@ -155,19 +154,34 @@ def length_gradient(
     end, cusp = contours.end.ravel(), np.repeat(contours.cusp, 2)
     at_cusp = np.flatnonzero((end < 0) & (cusp >= 0))
     passing = np.flatnonzero(end >= 0)
-    k, f = end[passing], force[passing]
-    p, q = crossings.edge[k].T
-    corners = faces[crossings.face[k]]
+    through = crossings.only(end[passing])
+    at, rows = force_on_crossings(vertices, faces, through, force[passing])
+    return np.concatenate([cusp[at_cusp], at]), np.concatenate([force[at_cusp], rows])
+
+
+def force_on_crossings(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    crossings: EdgeCrossings,
+    force: Float[np.ndarray, "K 3"],
+) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+    """Forces on places where edges pass through triangles, as vertices and the force on each.
+
+    Where edge pq passes through a triangle with the normal n, the place is p + t (q - p) =
+    alpha a + beta b + gamma c. A force f on it acts on the edge as f - h and on the triangle as h,
+    h = n f.(q - p) / n.(q - p), in these shares.
+    """
+    p, q = crossings.edge.T
+    corners = faces[crossings.face]
     edge = vertices[q] - vertices[p]
     normal = area_normals(vertices, corners)
     through = dot(normal, edge)
-    h = normal * (dot(f, edge) / np.where(through != 0, through, np.inf))[:, None]
-    part = crossings.part[k][:, None]
-    shares = barycentric(vertices[corners], crossings.point[k])
-    at = [cusp[at_cusp], p, q, *corners.T]
-    rows = [force[at_cusp], (1 - part) * (f - h), part * (f - h)]
+    h = normal * (dot(force, edge) / np.where(through != 0, through, np.inf))[:, None]
+    part = crossings.part[:, None]
+    shares = barycentric(vertices[corners], crossings.point)
+    rows = [(1 - part) * (force - h), part * (force - h)]
     rows += [shares[:, c, None] * h for c in range(3)]
-    return np.concatenate(at), np.concatenate(rows)
+    return np.concatenate([p, q, *corners.T]), np.concatenate(rows)
 
 
 def barycentric(

@@ -45,8 +45,8 @@ class EdgeCrossings:
     point: Float[np.ndarray, "K 3"]
     jump: Int[np.ndarray, "K"]
 
-    def only(self, kept: Bool[np.ndarray, "K"]) -> "EdgeCrossings":
-        """Some of the crossings."""
+    def only(self, kept: Bool[np.ndarray, "K"] | Int[np.ndarray, "N"]) -> "EdgeCrossings":
+        """Some of the crossings, marked or by number."""
         return replace(self, **{name: value[kept] for name, value in vars(self).items()})
 
 
