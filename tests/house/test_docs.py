@@ -92,6 +92,9 @@ EXPECTED = {
         "(6, 3)", "4.0", "[[0 1 2]]", "0.112 of the solid, -0.28 a unit along x"
     ),
     "recipes/own-body.md": the_worm_is_free,
+    "recipes/open-meshes.md": prints(
+        "2 holes", "litres", "cm^2 inside", "pushed to -x", "intersection-free", "not move: True"
+    ),
     "recipes/smplx.md": prints("cm^3 of collisions", "intersecting pairs"),
     "recipes/body-models.md": prints(
         " with adapt", "body_pose", "collision-free", "fit for the penalty", "after"
