@@ -109,13 +109,10 @@ class SheetInSolids:
         found[manifold.origin] = np.where(self._is_sheet[manifold.part[: len(own)]], own, 0)
         return found
 
-    @cached_property
+    @property
     def pairs(self) -> int:
         """How many pairs of the sheet's triangles and the solids' intersect."""
-        surface = self.surface
-        sheet = self._is_sheet[surface.manifold.part[surface.manifold.faces[:, 0]]]
-        first, second = sheet[surface.contours.pair].T
-        return int(np.count_nonzero((first != second) & surface.listed))
+        return len(self.intersecting()[0])
 
     def area(self) -> tuple[float, Float[np.ndarray, "V 3"]]:
         """The area inside, and its derivative by all vertices.
@@ -187,6 +184,21 @@ class SheetInSolids:
             return inside, np.zeros(0), np.zeros((0, 3), np.int64), np.zeros((0, 3))
         depth, face, shares = nearest_points(self.vertices[inside], self.vertices[solid])
         return inside, depth, solid[face], shares
+
+    def nearest(self) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+        """The sheet's vertices inside, and for each the nearest place on the solids' surface."""
+        inside, _, corners, shares = self._depths
+        return inside, np.einsum("nk,nkc->nc", shares, self.vertices[corners])
+
+    def intersecting(self) -> tuple[Int[np.ndarray, "P 3"], Int[np.ndarray, "P 3"]]:
+        """Corners of the sheet's triangles and of the solids' that intersect, pair by pair."""
+        surface = self.surface
+        faces = surface.manifold.kept[surface.contours.pair]
+        sheet = self._sheets(surface.contours.pair.ravel()).reshape(-1, 2)
+        between = np.flatnonzero((sheet[:, 0] != sheet[:, 1]) & surface.listed)
+        faces, sheet = faces[between], sheet[between]
+        first = np.where(sheet[:, 0], faces[:, 0], faces[:, 1])
+        return self.faces[first], self.faces[faces.sum(axis=1) - first]
 
     @property
     def depths(self) -> Float[np.ndarray, "V"]:

@@ -161,6 +161,7 @@ def free_vertices(
     steps_per_attempt: int,
     whole_parts: bool,
     on_step: OnStep,
+    fixed: Bool[np.ndarray, "V"] | None = None,
 ) -> Freed:
     """Vertices near those given at which no triangles intersect, as far as it goes.
 
@@ -179,15 +180,16 @@ def free_vertices(
         steps_per_attempt: at most so many in each.
         whole_parts: whether connected parts are pushed apart as they are where no attempt did.
         on_step: called with a `Step` before each step.
+        fixed: vertices that stay; a part with one of them is not pushed as a whole.
 
     Raises:
         Unmeasurable: the vertices given have no surface that could be measured.
     """
-    search = _Search(surface, vertices, sampling, on_step)
+    search = _Search(surface, vertices, sampling, on_step, fixed)
     best = start = search.start
     # Without an intersection there is nothing to shrink: what touches stays in touch, and a part
     # within another whole would be pushed into nothing.
-    if not start.pairs:
+    if not start.pairs or not search.may_move.any():
         return Freed(start, start)
     regions = search.regions()
     for attempt in range(attempts):
@@ -206,7 +208,14 @@ def free_vertices(
 
 
 class _Search:
-    def __init__(self, surface: Surface, vertices: np.ndarray, sampling: Sampling, on_step: OnStep):
+    def __init__(
+        self,
+        surface: Surface,
+        vertices: np.ndarray,
+        sampling: Sampling,
+        on_step: OnStep,
+        fixed: np.ndarray | None,
+    ):
         self.surface, self.sampling, self.on_step = surface, sampling, on_step
         self.dtype = vertices.dtype
         self.steps = 0
@@ -224,6 +233,9 @@ class _Search:
         self.edge_length = surface.edge_length(given)
         parts = np.unique(surface.part[self.start.crossed])
         self.may_move = np.isin(surface.part, parts)
+        if fixed is not None:
+            self.may_move &= ~fixed
+            parts = np.setdiff1d(parts, surface.part[fixed])
         # Of two parts that intersect, this one gives way: the smaller one of those that may.
         self._weight = np.where(np.isin(np.arange(surface.num_parts), parts), self._size, np.inf)
 
@@ -411,6 +423,8 @@ class _Search:
             low, high = self.surface.part_boxes(place.vertices)
             for pair in pairs:
                 mover, other = pair[np.argsort(self._weight[pair], kind="stable")]
+                if self._weight[mover] == np.inf:
+                    continue
                 gap = _GAP * self._size[mover]
                 # By how much to go up, and by how much down.
                 ways = np.stack([high[other] - low[mover], low[other] - high[mover]])

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax._mesh_check import check_mesh, one_mesh
 from spt_jax._query import as_directions, as_rays
@@ -13,8 +13,10 @@ from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax._steps import OnStep, no_step
 from spt_jax.overlap.measure import Sampling
 from spt_jax.overlap.rays.beam import Rays
+from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.freeing import Freed, Place, free_vertices
+from spt_jax.untangle.garment import SheetPlace, free_sheet
 from spt_jax.untangle.spread import Surface
 
 
@@ -88,6 +90,7 @@ def untangle_mesh(
     vertices: Float[Array, "V 3"] | np.ndarray,
     faces: Int[Array, "F 3"] | np.ndarray,
     *,
+    fixed: Bool[Array, "V"] | np.ndarray | None = None,
     rays: Rays = None,
     directions: Any = 3,
     attempts: int = 4,
@@ -124,6 +127,12 @@ def untangle_mesh(
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
             must be closed and consistently wound; it need not be connected.
+        fixed: a mask of vertices that stay where they are, to the bit: the body that a garment is
+            to be freed from. Parts with a hole, however small, are garments then, if all parts that
+            are closed are fixed: they stay open, and are moved until none of their triangles
+            intersects a solid's and none of their vertices lies in one (`sheet_report`); `volume`
+            of the result is depth times area, as in `sheet_penalty(value="depth")`. What garments
+            do to each other and to themselves is not looked at.
         rays: as in `self_intersection_penalty`, for the gradient that the search follows; what is
             compared and reported is exact in any case.
         directions: as in `self_intersection_penalty`.
@@ -139,9 +148,10 @@ def untangle_mesh(
     Raises:
         TypeError: vertices not float32 or float64, or traced; faces not whole numbers; rays or
             directions that are no numbers.
-        ValueError: wrong shapes; a mesh that is not closed and consistently wound, that is inside
-            out or not finite; `spt_jax.overlap.measure.Unmeasurable` for one that is too crumpled,
-            or too far from the origin; rays, attempts or steps_per_attempt not positive.
+        ValueError: wrong shapes; a mask that does not fit; a mesh that is not closed but for holes
+            and consistently wound, that is inside out or not finite;
+            `spt_jax.overlap.measure.Unmeasurable` for one that is too crumpled, or too far from the
+            origin; rays, attempts or steps_per_attempt not positive.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
 
@@ -163,12 +173,21 @@ def untangle_mesh(
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"{name} must be a positive whole number: got {count!r}.")
     sampling = Sampling(as_rays(rays), as_directions(directions))
-    check_mesh(vertices, faces).raise_if_unfit()
     points, triangles = one_mesh(vertices, faces)
+    stays = _as_mask(fixed, len(points))
+    surface = Surface(triangles, len(points))
+    if stays is not None:
+        garment = _garments(surface, stays)
+        if garment is not None:
+            check_mesh(points, surface.faces[~garment]).raise_if_unfit()
+            most = attempts * steps_per_attempt
+            return _without_sheets(points, surface, garment, stays, most, on_step or no_step)
+    check_mesh(vertices, faces).raise_if_unfit()
     return untangle_checked(
         points,
-        Surface(triangles, len(points)),
+        surface,
         sampling,
+        fixed=stays,
         attempts=int(attempts),
         steps_per_attempt=int(steps_per_attempt),
         on_step=on_step,
@@ -184,6 +203,7 @@ def untangle_checked(
     steps_per_attempt: int = 40,
     whole_parts: bool = True,
     on_step: OnStep | None = None,
+    fixed: Bool[np.ndarray, "V"] | None = None,
 ) -> UntangleMeshResult:
     """`untangle_mesh` for a mesh that is known to be fit: many poses of one body, say.
 
@@ -193,6 +213,7 @@ def untangle_checked(
         sampling: how the gradient is measured.
         attempts, steps_per_attempt, on_step: as in `untangle_mesh`.
         whole_parts: whether connected parts are pushed apart as they are where no attempt did.
+        fixed: vertices that stay.
 
     Raises:
         Unmeasurable: there is no surface that could be measured.
@@ -205,25 +226,89 @@ def untangle_checked(
         steps_per_attempt=steps_per_attempt,
         whole_parts=whole_parts,
         on_step=on_step or no_step,
+        fixed=fixed,
     )
-    start, best = found.start.vertices, found.best.vertices
+    return _result(
+        vertices,
+        surface,
+        (found.start.vertices, found.best.vertices),
+        before=_overlap(found.start),
+        after=_overlap(found.best),
+        inverted_parts=found.best.inverted,
+        steps=found.steps,
+        status=_status(found),
+    )
+
+
+def _result(given, surface: Surface, places, **values: Any) -> UntangleMeshResult:
+    """With what follows from the vertices before and after."""
+    start, best = places
     shift = best - start
     far, size = surface.farthest(shift), surface.part_sizes(start)
     length = np.linalg.norm(shift, axis=1)
     length = length[length > 0]
     return UntangleMeshResult(
         # Exact: the search ends on values of this dtype. What did not move is what was given.
-        vertices=best.astype(vertices.dtype) if len(length) else vertices.copy(),
-        before=_overlap(found.start),
-        after=_overlap(found.best),
+        vertices=best.astype(given.dtype) if len(length) else given.copy(),
         moved=len(length),
         median_displacement=float(np.median(length)) if len(length) else 0.0,
         largest_displacement=float(length.max(initial=0.0)),
         relative_displacement=float((far / np.where(size > 0, size, 1.0)).max(initial=0.0)),
-        inverted_parts=found.best.inverted,
         flipped_triangles=_flipped(start, best, surface),
-        steps=found.steps,
-        status=_status(found),
+        **values,
+    )
+
+
+def _as_mask(fixed: Any, count: int) -> Bool[np.ndarray, "V"] | None:
+    if fixed is None:
+        return None
+    mask = np.asarray(fixed)
+    if mask.dtype != bool or mask.shape != (count,):
+        raise ValueError(
+            f"fixed must be a mask, one of True and False for each of the {count} vertices: got "
+            f"an array of {mask.dtype} of shape {mask.shape}; np.isin(np.arange({count}), indices) "
+            "makes one of indices."
+        )
+    return mask
+
+
+def _garments(surface: Surface, fixed: Bool[np.ndarray, "V"]) -> Bool[np.ndarray, "F"] | None:
+    """The faces of open parts that may move, where all other parts are fixed; None if not so."""
+    manifold = manifold_of(surface.faces, surface.num_vertices)
+    rim = np.zeros(surface.num_parts, bool)
+    for loop in manifold.loops[: manifold.num_fans]:
+        rim[surface.part[loop]] = True
+    part = surface.part[surface.faces[:, 0]]
+    whole = np.bincount(part, fixed[surface.faces].all(axis=1), surface.num_parts)
+    still = whole == np.bincount(part, minlength=surface.num_parts)
+    garment = rim & ~still
+    used = np.bincount(part, minlength=surface.num_parts) > 0
+    if not garment.any() or not still[used & ~garment].all() or not (used & ~garment).any():
+        return None
+    return garment[part]
+
+
+def _without_sheets(
+    points, surface: Surface, garment, fixed, most: int, on_step: OnStep
+) -> UntangleMeshResult:
+    before, after, steps = free_sheet(surface, points, garment, fixed, most=most, on_step=on_step)
+    free = not after.found.pairs and not after.inside.any()
+
+    def overlap(place: SheetPlace) -> Overlap:
+        ratio = float(np.mean(place.inside)) if len(place.inside) else 0.0
+        numbers: Any = (place.volume, place.volume, ratio, place.found.pairs, place.found.pairs)
+        return Overlap(*numbers)
+
+    ran_out = RESULTS.nonlinear_max_steps_reached
+    return _result(
+        points,
+        surface,
+        (before.vertices, after.vertices),
+        before=overlap(before),
+        after=overlap(after),
+        inverted_parts=0,
+        steps=steps,
+        status=RESULTS.successful if free else ran_out,
     )
 
 
