@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from spt_jax.cli.terminal import CommandError, err_console, out_console, show
 
 if TYPE_CHECKING:
+    from spt_jax._camera import PinholeCamera
     from spt_jax.datasets import Summary
 
 # Files that are worked on and have a bar of their own; a cluster has more than a screen has lines.
@@ -56,6 +57,38 @@ def over_folder(
     if not quiet:
         _warn(summary, out)
     return 1 if {"failed", "lost"} & set(summary.by_status) else 0
+
+
+def folder_camera(
+    camera: Path | None,
+    focal: float | None,
+    center: tuple[float, float] | None,
+    max_bytes: int | None,
+) -> "PinholeCamera | None":
+    """The camera of all files of a folder, if one is given.
+
+    Raises:
+        ValueError, TypeError, OSError: a file that holds none; a focal length without a center.
+    """
+    if camera is None and focal is None and center is None:
+        return None
+    if camera is not None and (focal is not None or center is not None):
+        raise ValueError("camera must be given as a file, or by focal and center: got both.")
+    from spt_jax._camera import PinholeCamera
+    from spt_jax.cli.annotated import read_camera
+
+    if camera is not None:
+        return read_camera(camera, max_bytes=max_bytes)
+    if focal is None or center is None:
+        raise ValueError("of a folder, focal and center must be given together: got one of them.")
+    return PinholeCamera(focal, center)
+
+
+def refuse_for_folder(**used: bool) -> None:
+    """Raise ValueError where an option is given that is for one file."""
+    for name, given in used.items():
+        if given:
+            raise ValueError(f"{name} is for a single file: got it with a folder; leave it out.")
 
 
 def tell(summary: "Summary", out: Path, console: Console) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import tyro
 
+from spt_jax.cli.datasets import folder_camera, over_folder, refuse_for_folder
 from spt_jax.cli.terminal import (
     CommandError,
     err_console,
@@ -41,12 +42,17 @@ def fit(
     robust: float | Literal["auto", "off"] = "auto",
     fit_shape: bool = False,
     together: bool = False,
+    engine: Literal["local", "ray"] = "local",
+    processes: int | Literal["auto"] = "auto",
+    shard: str | None = None,
+    ray_address: str | None = None,
     anew: bool = False,
+    retry: bool = False,
     max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Find the 3D poses of the people in a file of 2D keypoints.
+    """Find the 3D poses of the people in a file of 2D keypoints, or in each file of a folder.
 
     Takes COCO's annotations and results, what MMPose, AlphaPose, Detectron2, Ultralytics and
     OpenPose write as JSON, DeepLabCut's tables, and JSON or .npz files of this project
@@ -56,8 +62,11 @@ def fit(
     outside any photograph. What is done is kept in OUT/unfinished until all is: a run that was
     ended goes on with the same command.
 
+    Of a folder each file becomes an .npz of poses, with a manifest, a summary and a report as
+    `clean` writes them; people are fitted one by one.
+
     Args:
-        keypoints: the file, .json or .npz.
+        keypoints: the file, .json or .npz, or a folder of them.
         out: folder for the results, made where missing.
         layout: the order of the keypoints, such as coco17, body25_hands, wholebody133, mpii16 or
             smpl24, or their names with commas between them; what the file says if not given.
@@ -82,7 +91,12 @@ def fit(
         fit_shape: fit the body's shape too.
         together: fit the people of an image as one scene, so that they do not pass through each
             other either.
+        engine: of a folder: "local", processes of this machine, or "ray", a Ray cluster.
+        processes: of a folder: how many; "auto": as many as there is room for.
+        shard: of a folder: i/n with i from 0, one of n parts of the files alone.
+        ray_address: of the cluster; not given: RAY_ADDRESS, or one on this machine.
         anew: throw away what is done of an unfinished run in the folder.
+        retry: of a folder: try files again that failed.
         max_bytes: what each file that is read, its arrays and a photograph's pixels may take; not
             given: 256 MiB of JSON, 1 GiB of anything else.
         json: print the report as JSON in place of the table.
@@ -91,6 +105,33 @@ def fit(
     if robust not in ("auto", "off") and not robust > 0:
         raise CommandError(
             f"robust must be a positive number of pixels, auto or off: got {robust}."
+        )
+    if keypoints.is_dir():
+        with user_errors():
+            seen = folder_camera(camera, focal, center, max_bytes)
+            refuse_for_folder(image=image is not None, people=people != "all", together=together)
+        from spt_jax.datasets import fit as start_fit
+
+        return over_folder(
+            start_fit,
+            keypoints,
+            out,
+            layout=layout,
+            camera=seen,
+            body=body,
+            regularizer=regularizer,
+            fold_distance=fold_distance,
+            robust=robust,
+            fit_shape=fit_shape,
+            engine=engine,
+            processes=processes,
+            shard=shard,
+            ray=(ray_address, 1.0, None, 3),
+            anew=anew,
+            retry=retry,
+            max_bytes=max_bytes,
+            json=json,
+            quiet=quiet,
         )
     from spt_jax._exclusions import as_fold_distance
     from spt_jax.cli.annotated import as_map, gather, of_the_body

@@ -10,6 +10,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.datasets.engines.events import Progress as Progress
     from spt_jax.datasets.items.work import Task as Task
     from spt_jax.datasets.items.work import UnknownFileError as UnknownFileError
+    from spt_jax.datasets.keypoints import fit as fit
     from spt_jax.datasets.motions import clean as clean
     from spt_jax.datasets.motions import measure as measure
     from spt_jax.datasets.runs import run as run
@@ -23,6 +24,7 @@ __all__ = [
     "Task",
     "UnknownFileError",
     "clean",
+    "fit",
     "measure",
     "run",
 ]
@@ -34,6 +36,7 @@ __getattr__, __dir__ = _lazy_names(
         "Progress": "spt_jax.datasets.engines.events",
         "Resources": "spt_jax.datasets.engines.cluster",
         "clean": "spt_jax.datasets.motions",
+        "fit": "spt_jax.datasets.keypoints",
         "measure": "spt_jax.datasets.motions",
         "run": "spt_jax.datasets.runs",
         "Summary": "spt_jax.datasets.summary",

@@ -45,12 +45,12 @@ def file_figures(people: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The figures of a file of several people, from theirs: sums, means, maxima."""
     keys: Iterable[str] = dict.fromkeys(key for one in people for key in one)
     found: dict[str, Any] = {"people_count": len(people)}
-    frames = np.array([one["frames"] for one in people], float)
     for key in keys:
         values: list[Any] = [one[key] for one in people if key in one]
         if key.startswith("largest_"):
             found[key] = max(values)
         elif key.startswith("mean_"):
+            frames = [one["frames"] for one in people if key in one]
             found[key] = float(np.average(values, weights=frames))
         elif key.startswith("frames_by_"):
             found[key] = np.sum(values, axis=0).tolist()

@@ -45,7 +45,7 @@ class MeasureMotions:
 
     def settings(self) -> dict[str, Any]:
         """All that a figure depends on."""
-        return {"body": _body_key(self.body), "fold_distance": self.fold_distance}
+        return {"body": as_body_key(self.body), "fold_distance": self.fold_distance}
 
     def wants(self, path: Path) -> bool:
         """Whether the suffix is one of pose files."""
@@ -311,7 +311,7 @@ def clean(
     _check_not_negative(margin=margin, feet=feet, pictures=pictures)
     task = CleanMotions(
         body=os.fspath(body),
-        fold_distance=_as_fold_distance(fold_distance),
+        fold_distance=as_fold_distance_given(fold_distance),
         max_bytes=max_bytes,
         pictures=pictures,
         structure=structure,
@@ -364,14 +364,14 @@ def measure(
     _check_not_negative(pictures=pictures)
     task = MeasureMotions(
         body=os.fspath(body),
-        fold_distance=_as_fold_distance(fold_distance),
+        fold_distance=as_fold_distance_given(fold_distance),
         max_bytes=max_bytes,
         pictures=pictures,
     )
     return run(task, folder, out, **how)
 
 
-def _body_key(body: str) -> str:
+def as_body_key(body: str) -> str:
     """The body's name, or the hash of its file: where it lies does not matter."""
     if body == "anny":
         return body
@@ -381,7 +381,8 @@ def _body_key(body: str) -> str:
     return f"sha256:{sha256(as_file(body, 'body model'))}"
 
 
-def _as_fold_distance(value: Any) -> float | None:
+def as_fold_distance_given(value: Any) -> float | None:
+    """A distance along the rest surface, or None, checked before a run begins."""
     from spt_jax._exclusions import as_fold_distance
 
     return as_fold_distance(value)

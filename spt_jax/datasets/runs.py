@@ -66,7 +66,8 @@ def run(
         FileNotFoundError, NotADirectoryError: there is no such folder.
         OSError: `out` cannot be written, or is full. What is done stays.
         ValueError: `out` is the folder or holds it, or results of other settings; a shard, engine
-            or number of processes that is none.
+            or number of processes that is none; a task of the script that runs, which other
+            processes cannot import.
         RuntimeError: a process or the cluster cannot start.
 
     Example:
@@ -90,6 +91,11 @@ def run(
     part, count = as_shard(shard), _as_processes(processes)
     if engine not in ("local", "ray"):
         raise ValueError(f'engine must be "local" or "ray": got {engine!r}.')
+    if type(task).__module__ == "__main__" and (count or engine == "ray"):
+        raise ValueError(
+            f"task must be of a class that other processes can import: got {type(task).__name__}, "
+            "of the script that runs; move it into a module, or work with processes=0."
+        )
     report = on_event or (lambda event: None)
     begin = time.perf_counter()
     found = take_inventory(source, target, task.wants)

@@ -135,6 +135,9 @@ def test_faults_of_the_caller(tmp_path):
     ):
         with pytest.raises(error, match=said):
             run(Upper(), *arguments, **({"processes": 0} | how))
+    local = type("Local", (Upper,), {"__module__": "__main__"})
+    with pytest.raises(ValueError, match="got Local, of the script that runs"):
+        run(local(), folder, out, processes=1)
     with pytest.raises(RuntimeError, match="scale must not be negative"):
         run(Upper(scale=-1), folder, tmp_path / "other", processes=1)
     (tmp_path / "file").write_text("")

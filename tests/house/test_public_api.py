@@ -142,6 +142,7 @@ NAMESPACES = {
         "Task",
         "UnknownFileError",
         "clean",
+        "fit",
         "measure",
         "run",
     ],

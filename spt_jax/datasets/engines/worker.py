@@ -26,12 +26,12 @@ def serve() -> None:
     os.dup2(2, 1)  # whatever else is printed belongs to the errors
     orders: SimpleQueue[Any] = SimpleQueue()
     threading.Thread(target=_listen, args=(orders,), daemon=True).start()
-    store, task = pickle.loads(orders.get())
     try:
+        store, task = pickle.loads(orders.get())
         task.start()
     except Exception as error:
         send(answers, ("failed", f"{type(error).__name__}: {' '.join(str(error).split())}"))
-        return
+        os._exit(1)  # at once: the thread that listens holds a lock that Python would wait for
     send(answers, ("ready", None))
     while True:
         send(answers, _answer(store, task, orders.get(), answers))
