@@ -1,7 +1,7 @@
 """Pose files of a folder measured, or freed of collisions, each as a whole motion."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -50,6 +50,14 @@ class MeasureMotions:
     def wants(self, path: Path) -> bool:
         """Whether the suffix is one of pose files."""
         return path.suffix.lower() in SUFFIXES
+
+    def are_one(self, paths: Sequence[Path]) -> bool:
+        """Whether numbered files hold the frames of one motion: the first and the last hold one."""
+        try:
+            files = [open_poses(path, max_bytes=self.max_bytes) for path in (paths[0], paths[-1])]
+        except (ValueError, OSError):
+            return False
+        return all(len(track.pose) == 1 for file in files for track in file.tracks)
 
     def start(self) -> None:
         """Load the body."""

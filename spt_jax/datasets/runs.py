@@ -98,7 +98,8 @@ def run(
         )
     report = on_event or (lambda event: None)
     begin = time.perf_counter()
-    found = take_inventory(source, target, task.wants)
+    together = getattr(task, "are_one", None)
+    found = take_inventory(source, target, task.wants, together or (lambda paths: False))
     store = Store(target)
     store.begin({"task": task.name, **task.settings()}, anew=anew)
     mine = [item for item in found.items if part.has(item.name)]

@@ -32,7 +32,7 @@ def ensure_folder(path: str | os.PathLike[str]) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise _folder_error(folder, error) from error
+        raise folder_error(folder, error) from error
     return folder
 
 
@@ -65,7 +65,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         temporary.touch(exist_ok=False)
     except OSError as error:
-        raise _folder_error(target.parent, error) from error
+        raise folder_error(target.parent, error) from error
     try:
         yield temporary
         os.replace(temporary, target)
@@ -105,7 +105,8 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _folder_error(folder: Path, error: OSError) -> OSError:
+def folder_error(folder: Path, error: OSError) -> OSError:
+    """The system's error about a folder that cannot be written, with what to do."""
     return type(error)(
         f"out must be a folder that can be written: got {str(folder)!r} ({error.strerror}); "
         "make the folder or choose another"

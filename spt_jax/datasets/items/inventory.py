@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from spt_jax.datasets.items.store import RESERVED, Store
 
 
 class Item(NamedTuple):
-    """A file of a data set.
+    """A file of a data set, or a folder of files that belong together.
 
     Attributes:
         name: its path in the folder, with slashes.
@@ -40,18 +40,26 @@ class Inventory(NamedTuple):
     examples: dict[str, str]
 
 
-def take_inventory(folder: Path, out: Path, wanted: Callable[[Path], bool]) -> Inventory:
+def take_inventory(
+    folder: Path,
+    out: Path,
+    wanted: Callable[[Path], bool],
+    one: Callable[[Sequence[Path]], bool] = lambda paths: False,
+) -> Inventory:
     """Look through a folder and all below it; links to folders are followed, each folder once.
 
     Args:
         folder: where to look.
         out: where results go; it is left out where it lies in the folder.
         wanted: whether a file is one of the data set.
+        one: whether files of one folder, which are called alike but for a number at the end, are
+            the frames of one item, the folder.
 
     Raises:
         OSError: a folder cannot be read.
     """
     items, others, examples = [], Counter(), {}
+    places: dict[Path, list[Item]] = {}
     for path in _files(folder, out.resolve()):
         name = path.relative_to(folder).as_posix()
         if name in RESERVED and (folder / Store.FOLDER).exists():
@@ -66,8 +74,23 @@ def take_inventory(folder: Path, out: Path, wanted: Callable[[Path], bool]) -> I
         except OSError:  # a link to nothing: the reader says so, in a row of its own
             items.append(Item(name, path, 0, 0))
             continue
-        items.append(Item(name, path, found.st_size, found.st_mtime_ns))
+        item = Item(name, path, found.st_size, found.st_mtime_ns)
+        places.setdefault(path.parent, []).append(item)
+    for place, inner in places.items():
+        alike = len(inner) > 1 and len({_unnumbered(item.path) for item in inner}) == 1
+        if place != folder and alike and one([item.path for item in inner]):
+            name = place.relative_to(folder).as_posix()
+            size, modified = sum(i.size for i in inner), max(i.modified for i in inner)
+            items.append(Item(name, place, size, modified))
+        else:
+            items += inner
     return Inventory(tuple(sorted(items)), dict(sorted(others.items())), examples)
+
+
+def _unnumbered(path: Path) -> tuple[str, str]:
+    """A file's name without the number at the end of its stem; of one without, all of it."""
+    start = path.stem.rstrip("0123456789")
+    return (start, path.suffix) if start != path.stem else (path.name, "")
 
 
 def _files(folder: Path, out: Path) -> Iterator[Path]:

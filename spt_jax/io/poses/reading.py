@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from spt_jax.io.poses.datasets import (
     read_easymocap,
     read_mmhuman3d,
 )
+from spt_jax.io.poses.folder import read_folder
 from spt_jax.io.poses.parts import BODY, ROOT, read_in_parts
 from spt_jax.io.poses.people import (
     by_person,
@@ -49,7 +51,9 @@ _OTHERS = (
 
 
 def is_pose_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is for the readers of poses, by its suffix."""
+    """Whether a file is for the readers of poses, by its suffix; a folder is, too."""
+    if os.path.isdir(path):
+        return True
     return os.path.splitext(os.fspath(path))[1].lower() in (*SUFFIXES, *_OTHERS, "")
 
 
@@ -128,7 +132,7 @@ def load_poses(
     Pickles are read without running anything that they name, and without PyTorch or joblib.
 
     Args:
-        path: the file.
+        path: the file, or a folder of files that hold a frame each.
         people: whom, by name or by number from 0; all where None.
         max_bytes: what the file and its arrays may take; 1 GiB where None.
 
@@ -163,6 +167,14 @@ def open_poses(path: str | os.PathLike[str], *, max_bytes: int | None = None) ->
 
     Args, Raises: as `load_poses`.
     """
+    if os.path.isdir(path):
+        folder = Path(path)
+        inner = [
+            file
+            for file in folder.rglob("[!.]*")
+            if file.suffix.lower() in SUFFIXES and file.is_file()
+        ]
+        return read_folder(folder, [open_poses(f, max_bytes=max_bytes) for f in sorted(inner)])
     return read_motion(open_container(path, max_bytes=max_bytes))
 
 
