@@ -89,7 +89,9 @@ def main(settings: Settings) -> None:
     print(*lines, sep="\n")
     if settings.record:
         command = "python -m benchmarks.blender --blender PYTHON --validator FOLDER"
-        body = "\n\n".join([provenance(command), __doc__.split("\n\n", 1)[1], table.markdown()])
+        body = "\n\n".join(
+            [provenance(command), (__doc__ or "").split("\n\n", 1)[1], table.markdown()]
+        )
         record_section("blender", "Rigs beside Blender", "\n\n".join([body, *lines]))
 
 

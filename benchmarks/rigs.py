@@ -43,7 +43,7 @@ def main(settings: Settings) -> None:
     for table in tables:
         table.print()
     if settings.record:
-        text = __doc__.split("\n\n", 1)[1]
+        text = (__doc__ or "").split("\n\n", 1)[1]
         parts = [provenance("python -m benchmarks.rigs --record"), text]
         parts += [table.markdown() for table in tables]
         record_section("rigs", "Rigs beside the embedded body", "\n\n".join(parts))
@@ -106,7 +106,7 @@ def octopus() -> BodyModel:
         radius = 0.085 - 0.06 * along / _LENGTH
         radius *= np.sqrt(np.clip(1 - ((along - _LENGTH / 2) / (_LENGTH / 2)) ** 16, 0, 1))
         tube = trimesh.creation.revolve(np.column_stack([radius, along]), sections=20)
-        turn = trimesh.geometry.align_vectors([0, 0, 1], out)
+        turn = np.asarray(trimesh.geometry.align_vectors([0, 0, 1], out))
         turn[:3, 3] = first
         parts.append(tube.apply_transform(turn))
         for link in range(_LINKS):
@@ -182,7 +182,8 @@ def octopus_motion(folder: Path, draw: bool) -> Table:
         labels = [intersection_report(v, rig.body.faces, rest_surface=rest).labels for v in pair]
         where = FIGURES / "rig.png"
         render_before_after(
-            *map(np.asarray, pair),
+            np.asarray(pair[0]),
+            np.asarray(pair[1]),
             np.asarray(rig.body.faces),
             *labels,
             titles=("as animated", "freed"),

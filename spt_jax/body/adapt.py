@@ -2,7 +2,8 @@
 
 import copy
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,14 @@ import numpy as np
 
 from spt_jax.body.adapted import MATRICES, TURN, AdaptedBody
 from spt_jax.body.function_body import FunctionBody, body_of_function
+
+
+@overload
+def adapt(model: Any) -> AdaptedBody: ...
+
+
+@overload
+def adapt(model: Callable, *, faces: Any, rest_pose: Any) -> FunctionBody: ...
 
 
 def adapt(model: Any, *, faces: Any = None, rest_pose: Any = None) -> AdaptedBody | FunctionBody:

@@ -217,7 +217,7 @@ class AdaptedBody(AbstractBody):
             value = floating(name, parameters[name])
             value = value if self._is_single(name) else jnp.moveaxis(value, _axis(kind), 0)[k]
             with _as_written():
-                rows.append(SO3.convert(value, src=kind, dst="axis_angle", xp=jnp))
+                rows.append(SO3.convert(value, src=kind, dst="axis_angle", xp=jnp))  # type: ignore
         batch = jnp.broadcast_shapes(*(row.shape for row in rows))
         return jnp.stack([jnp.broadcast_to(row, batch) for row in rows], axis=-2)
 

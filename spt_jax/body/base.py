@@ -1,7 +1,7 @@
 """What every body has: vertices of a pose, faces, joints, and the surface at rest."""
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,10 +27,28 @@ class AbstractBody(eqx.Module):
     `faces`, `parents`, `joint_names` and `weights`, and what is abstract here.
     """
 
-    faces: eqx.AbstractVar[Int[Array, "F 3"]]
-    parents: eqx.AbstractVar[tuple[int, ...]]
-    joint_names: eqx.AbstractVar[tuple[str, ...]]
-    weights: eqx.AbstractVar[Any]
+    if TYPE_CHECKING:  # which takes what is to be overridden for fields of every subclass
+
+        @property
+        def faces(self) -> Any:  # noqa: D102
+            ...
+
+        @property
+        def parents(self) -> tuple[int, ...]:  # noqa: D102
+            ...
+
+        @property
+        def joint_names(self) -> tuple[str, ...]:  # noqa: D102
+            ...
+
+        @property
+        def weights(self) -> Any:  # noqa: D102
+            ...
+    else:
+        faces: eqx.AbstractVar[Int[Array, "F 3"]]
+        parents: eqx.AbstractVar[tuple[int, ...]]
+        joint_names: eqx.AbstractVar[tuple[str, ...]]
+        weights: eqx.AbstractVar[Any]
 
     @abstractmethod
     def __call__(self, pose, shape=None, translation=None) -> PosedBody:

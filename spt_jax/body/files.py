@@ -82,7 +82,7 @@ def load_body(
     if suffix not in (".npz", ".pkl", ".npy"):
         raise ValueError(
             'source must be "anny" or the path to an .npz, .pkl or .npy file: got '
-            f"{os.fspath(source)!r}."
+            f"{os.fspath(source)!r}; rigs (.glb, .gltf, .vrm) are for load_rig."
         )
     if not path.exists():
         raise FileNotFoundError(f"there is no body model file at {path}; check the path.")

@@ -99,7 +99,12 @@ def untangle_together(
             for k, one in enumerate(whole):
                 group = _group(model, len(scenes.rows[k]))
                 done += untangle_frames(
-                    group, one, **options, state=state, run=_Item(run, k), keep_vertices=True
+                    group,
+                    one,
+                    **options,
+                    state=state,
+                    run=_Item(run, k),  # pyright: ignore[reportArgumentType]
+                    keep_vertices=True,
                 )
                 state(one.names[0], done=k + 1)
                 counted.append(_counted(group, done[-1], options))

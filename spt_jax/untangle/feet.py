@@ -75,7 +75,7 @@ def feet_of(body: AbstractBody) -> Bool[np.ndarray, "K V"]:
             own = [body.joint_names.index(name)]
             own += [j for j, p in enumerate(body.parents) if _is_below(body.parents, p, own[0])]
             found.append(np.asarray(body.weights)[:, own].sum(axis=1) > 0.5)
-    return np.array(found).reshape(-1, body.num_vertices)
+    return np.array(found, bool).reshape(-1, body.num_vertices)
 
 
 def _is_below(parents: tuple[int, ...], joint: int, ancestor: int) -> bool:

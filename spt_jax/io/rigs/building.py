@@ -72,8 +72,7 @@ def build(
     bound[:, :3, :3] /= factor
     names += [f"{joints.names[j]} translation {axis}" for j in joints.shifting for axis in "xyz"]
     names += [f"{joints.names[j]} scale {axis}" for j in joints.scaling for axis in "xyz"]
-    # `weights` is a property of rigs.
-    body = RigModel(  # pyright: ignore[reportCallIssue]
+    body = RigModel(
         template=jnp.asarray(template, dtype),
         shape_basis=jnp.asarray(mesh.targets * factor, dtype),
         bone_weights=jnp.asarray(mesh.weights, dtype),

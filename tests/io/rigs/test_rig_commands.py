@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers_rigs import RigWriter, quaternion, tube
 
+from spt_jax import untangle_motion
 from spt_jax.cli import main as cli
 from spt_jax.io import load_poses, load_rig
 from spt_jax.io.poses.bvh import parse_bvh
@@ -64,6 +65,7 @@ def snake(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_untangle_writes_the_animation_back(snake, tmp_path, capsys):
     assert cli.main(["untangle", str(snake), "--out", str(tmp_path), "--json", "--quiet"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -119,8 +121,31 @@ def test_frames_and_characters_are_chosen(snake, tmp_path, capsys):
     assert "characters 'snake'" in capsys.readouterr().err
     assert cli.main([*asked, "--like-input"]) == 2
     assert "leave it out" in capsys.readouterr().err
-    assert cli.main([*asked, "--people", "snake", "--frames", "curl/0001", "--json"]) == 0
+    assert cli.main([*asked, "--people", "snake", "--frames", "curl/0000", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["frames"]) == 1
+    # Nothing turned: the animation that is written is the one that was there.
+    freed = load_rig(tmp_path / "snake_untangled.glb")
+    np.testing.assert_allclose(freed.clip(1).pose, freed.clip(0).pose, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_motion_of_a_rig_is_freed_as_a_whole(snake):
+    rig = load_rig(snake, dtype=np.float32)
+    clip = rig.clip("curl")
+    found = untangle_motion(
+        rig.body,
+        clip.pose.astype(np.float32),
+        shape=clip.shape.astype(np.float32),
+        frames_per_second=clip.frame_rate,
+    )
+    assert not found.before.is_free.all() and found.after.is_free.all()
+
+
+def test_a_character_of_virtual_reality_is_one(snake, tmp_path):
+    (tmp_path / "snake.vrm").write_bytes(snake.read_bytes())
+    rig = load_rig(tmp_path / "snake.vrm")
+    assert rig.name == "snake" and rig.write(tmp_path / "b.vrm", rig.clip()) == ("rest untangled",)
+    assert load_rig(tmp_path / "b.vrm").animations == ("curl", "rest untangled")
 
 
 def test_the_view_shows_a_rig_with_its_animations(snake):
