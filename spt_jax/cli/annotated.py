@@ -154,6 +154,14 @@ def of_the_body(
     return kept, [f"points of fingers, which the body has not: {lost}"] if lost else []
 
 
+def tracks_of(people: Sequence[Annotated]) -> dict[str, int]:
+    """The number of each person's track in a sequence, by the person's name."""
+    from spt_jax.keypoints import find_tracks
+
+    tracks = find_tracks([one.person for one in people])
+    return {people[row].name: number for number, rows in enumerate(tracks) for row in rows}
+
+
 def read_camera(path: Path, *, max_bytes: int | None = None) -> "PinholeCamera":
     """The camera of a .json or .npz file: `matrix` (3, 4), or `focal` and `center`.
 

@@ -46,6 +46,7 @@ def fit(
     processes: int | Literal["auto"] = "auto",
     shard: str | None = None,
     ray_address: str | None = None,
+    frames_per_second: float = 30.0,
     anew: bool = False,
     retry: bool = False,
     max_bytes: int | None = None,
@@ -58,15 +59,17 @@ def fit(
     OpenPose write as JSON, DeepLabCut's tables, and JSON or .npz files of this project
     ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
     .glb of each person coloured by label, a picture of each image with the bodies over it, and
-    report.json. The exit code is 1 if somebody could not be fitted, or if what was found lies
-    outside any photograph. What is done is kept in OUT/unfinished until all is: a run that was
-    ended goes on with the same command.
+    report.json. A folder of OpenPose's frames (NAME_NUMBER_keypoints.json) is a sequence: people
+    are followed from frame to frame, stay near the pose that they had, and are written as a motion
+    each (track_0.npz, ...). The exit code is 1 if somebody could not be fitted,
+    or if what was found lies outside any photograph. What is done is kept in OUT/unfinished until
+    all is: a run that was ended goes on with the same command.
 
-    Of a folder each file becomes an .npz of poses, with a manifest, a summary and a report as
+    Of any other folder each file becomes an .npz of poses, with a manifest, a summary and a report as
     `clean` writes them; people are fitted one by one.
 
     Args:
-        keypoints: the file, .json or .npz, or a folder of them.
+        keypoints: the file, .json, .npz or .csv, or a folder of them.
         out: folder for the results, made where missing.
         layout: the order of the keypoints, such as coco17, body25_hands, wholebody133, mpii16 or
             smpl24, or their names with commas between them; what the file says if not given.
@@ -95,6 +98,7 @@ def fit(
         processes: of a folder: how many; "auto": as many as there is room for.
         shard: of a folder: i/n with i from 0, one of n parts of the files alone.
         ray_address: of the cluster; not given: RAY_ADDRESS, or one on this machine.
+        frames_per_second: of the motions that are written of a folder of frames.
         anew: throw away what is done of an unfinished run in the folder.
         retry: of a folder: try files again that failed.
         max_bytes: what each file that is read, its arrays and a photograph's pixels may take; not
@@ -106,7 +110,10 @@ def fit(
         raise CommandError(
             f"robust must be a positive number of pixels, auto or off: got {robust}."
         )
-    if keypoints.is_dir():
+    from spt_jax.keypoints.folders import is_sequence
+
+    sequence = is_sequence(keypoints)
+    if keypoints.is_dir() and not sequence:
         with user_errors():
             seen = folder_camera(camera, focal, center, max_bytes)
             refuse_for_folder(image=image is not None, people=people != "all", together=together)
@@ -134,7 +141,7 @@ def fit(
             quiet=quiet,
         )
     from spt_jax._exclusions import as_fold_distance
-    from spt_jax.cli.annotated import as_map, gather, of_the_body
+    from spt_jax.cli.annotated import as_map, gather, of_the_body, tracks_of
     from spt_jax.files.outputs import ensure_folder, write_json
     from spt_jax.keypoints import keypoint_regressor, read_keypoints
 
@@ -162,6 +169,7 @@ def fit(
             scene_lines,
             summary,
             write_bodies,
+            write_motions,
         )
         from spt_jax.cli.fitting import fit_everyone, made_from, scenes_of
         from spt_jax.cli.frames import left_out
@@ -175,6 +183,7 @@ def fit(
                 chosen, {order: keypoint_regressor(model, order).placed for order in orders}
             )
             notes += lost
+            tracks = tracks_of(chosen) if sequence and not together else None
             groups = scenes_of(chosen) if together else [[one] for one in chosen]
             folder = ensure_folder(out)
         if any(one.camera_source == "estimated" for one in chosen):
@@ -192,14 +201,17 @@ def fit(
         }
         with user_errors():
             manifest = manifest_of(
-                "fit", options | {"together": together}, model, made_from(groups)
+                "fit", options | {"together": together, "tracks": tracks}, model, made_from(groups)
             )
             run = UnfinishedRun(folder, manifest, say=partial(show, err_console(quiet)), anew=anew)
         with run:
-            done, scenes = fit_everyone(model, groups, **options, state=state, run=run)
+            done, scenes = fit_everyone(
+                model, groups, **options, state=state, run=run, tracks=tracks
+            )
             with user_errors():
                 state("writing", done=len(chosen))
                 meshes = write_bodies(folder, done, model, fit_shape)
+                motions = write_motions(folder, done, tracks or {}, fit_shape, frames_per_second)
                 state("drawing")  # after the rest is safe
                 pictures, missing = draw(folder, done, model.faces)
                 settings = {
@@ -215,6 +227,7 @@ def fit(
                 report["seconds"] = round(time.perf_counter() - start, 3)
                 report["notes"] = notes
                 report["meshes"] = meshes
+                report["motions"] = motions
                 report["pictures"] = pictures
                 report["pictures_left_out"] = missing
                 write_json(folder / "report.json", report)

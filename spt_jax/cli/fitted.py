@@ -256,6 +256,33 @@ def write_bodies(
     return names
 
 
+def write_motions(
+    folder: Path,
+    people: Sequence[Fitted],
+    tracks: dict[str, int],
+    with_shape: bool,
+    frames_per_second: float,
+) -> list[str]:
+    """Write a motion a track, of the frames in which there is a body; return the files' names."""
+    from spt_jax.io.pose_files import write_poses
+
+    names = []
+    for number in sorted(set(tracks.values())):
+        bodies = [one for one in people if tracks.get(one.name) == number and one.usable]
+        if not bodies:
+            continue
+        names.append(f"track_{number}.npz")
+        write_poses(
+            folder / names[-1],
+            np.stack([one.pose for one in bodies]),
+            shape=bodies[0].shape if with_shape else None,
+            translation=np.stack([one.translation for one in bodies]),
+            names=[one.given.image for one in bodies],
+            frame_rate=frames_per_second,
+        )
+    return names
+
+
 def draw(folder: Path, people: Sequence[Fitted], faces: Any) -> tuple[list[str], str | None]:
     """Draw the bodies of each image over it; the pictures' names, or why there are none."""
     from spt_jax.show import render_overlay

@@ -2,10 +2,11 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from spt_jax.cli.annotated import Annotated
@@ -26,6 +27,8 @@ Robust = float | Literal["auto", "off"]
 # takes good points of unusual poses for mistakes: in 11 of 48 people who were seen in part, where
 # this scale did in 2.
 _ROBUST_SHARE = 0.1
+# How much an angle changes from frame to frame of a sequence, in radians: as `fit_motion` has it.
+_SPEED = 0.15
 _LEAST_SCALE = 5.0  # pixels, of somebody of whom a point or two are seen
 
 
@@ -71,12 +74,15 @@ def fit_everyone(
     fit_shape: bool,
     state: State,
     run: "UnfinishedRun",
+    tracks: Mapping[str, int] | None = None,
 ) -> tuple[list[Fitted], list[dict[str, Any]]]:
     """Fit everyone, and measure the bodies' overlaps.
 
     Group by group, so that each may have a camera and the bar moves on; it compiles once a layout
     and size of a group. A group of one is fitted alone, one of several as a scene. `run` keeps each
-    group as it is done, and has those that were done before.
+    group as it is done, and has those that were done before. `tracks` has the number of each
+    person's track in a sequence: somebody in a frame is near what he was in the frame before, and
+    with `fit_shape` all of a track have the shape of its first frame.
 
     Returns:
         The people, group by group; and of each scene what report.json says.
@@ -84,7 +90,10 @@ def fit_everyone(
     from spt_jax._exclusions import as_fold_surface
     from spt_jax.fit import people as scenes
     from spt_jax.fit import pose as fitting
+    from spt_jax.fit.motion import near_pose
     from spt_jax.fit.options import Scene, Start, Terms
+    from spt_jax.fit.problem.learned_priors import pose_prior
+    from spt_jax.fit.problem.priors import GaussianPosePrior
     from spt_jax.fit.regularizers import as_regularizer
     from spt_jax.fit.regularizers.spt import SelfIntersection
 
@@ -94,10 +103,13 @@ def fit_everyone(
     prepared = term.prepared(body, 1)
     folds = as_fold_surface(body, fold_distance)
     found, told, compiled = [], [], set()
+    before: dict[int, Fitted] = {}
+    usual = pose_prior(body.joint_names)
     for number, group in enumerate(groups):
         kept = run.found(number)
         if kept is not None:
             people, scene = people_of(kept, group)
+            before |= _ends_of(people, tracks)
             found += people
             told += [] if scene is None else [scene]
             continue
@@ -114,6 +126,12 @@ def fit_everyone(
             "start": Start(fit_shape=fit_shape),
         }
         scales = _robust_scales(group, robust)
+        last = before.get(tracks[group[0].name]) if tracks else None
+        prior: GaussianPosePrior = usual
+        if last is not None and last.usable:
+            prior = near_pose(usual, jnp.asarray(last.pose), _SPEED)
+            if fit_shape:
+                options["start"] = Start(shape=last.shape)
         points = np.stack([one.person.points for one in group]).astype(np.float32)
         scene = None
         if len(group) > 1:
@@ -132,7 +150,7 @@ def fit_everyone(
         else:
             options |= {
                 "confidence": options["confidence"][0],
-                "terms": Terms(robust=None if scales is None else scales[0]),
+                "terms": Terms(prior=prior, robust=None if scales is None else scales[0]),
             }
             result = fitting.fit_pose(body, points[0], group[0].camera, **options)
             results = jax.tree.map(lambda leaf: leaf[None], result)
@@ -143,12 +161,18 @@ def fit_everyone(
         for k, one in enumerate(group):
             result = jax.tree.map(lambda leaf, k=k: leaf[k], results)
             people.append(as_fitted(body, one, result, folds, seconds))
+        before |= _ends_of(people, tracks)
         arrays = people_arrays(people, scene)
         with user_errors():
             run.keep(number, arrays)
         found += people
         told += [] if scene is None else [scene]
     return found, told
+
+
+def _ends_of(people: Sequence[Fitted], tracks: Mapping[str, int] | None) -> dict[int, Fitted]:
+    """By track, who was fitted last."""
+    return {tracks[one.name]: one for one in people} if tracks else {}
 
 
 def _robust_scales(people: Sequence[Annotated], robust: Robust) -> np.ndarray | None:

@@ -10,6 +10,7 @@ import tyro
 
 from spt_jax.cli.check import check
 from spt_jax.cli.clean import clean
+from spt_jax.cli.compilation import keep_programs
 from spt_jax.cli.demo import demo
 from spt_jax.cli.fit import fit
 from spt_jax.cli.measure import measure
@@ -54,6 +55,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(args: Sequence[str] | None) -> int:
+    if args is None:  # a process of its own, whose environment is nobody else's
+        keep_programs()
     try:
         return tyro.extras.subcommand_cli_from_dict(
             _COMMANDS,

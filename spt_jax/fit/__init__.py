@@ -5,6 +5,8 @@ import typing
 from spt_jax._lazy import lazy_names as _lazy_names
 
 if typing.TYPE_CHECKING:
+    from spt_jax.fit.motion import MotionFit as MotionFit
+    from spt_jax.fit.motion import fit_motion as fit_motion
     from spt_jax.fit.options import Scene as Scene
     from spt_jax.fit.options import Search as Search
     from spt_jax.fit.options import Stages as Stages
@@ -42,6 +44,7 @@ __all__ = [
     "JointLimits",
     "Laplacian",
     "MixturePosePrior",
+    "MotionFit",
     "Nothing",
     "Penetration",
     "PeopleResult",
@@ -57,6 +60,7 @@ __all__ = [
     "Variables",
     "as_regularizer",
     "as_weights",
+    "fit_motion",
     "fit_people",
     "fit_pose",
     "joint_limits",
@@ -80,6 +84,7 @@ __getattr__, __dir__ = _lazy_names(
         "JointLimits": "spt_jax.fit.problem.limits",
         "Laplacian": f"{_REGULARIZERS}.laplacian",
         "MixturePosePrior": _PRIORS,
+        "MotionFit": "spt_jax.fit.motion",
         "Nothing": f"{_REGULARIZERS}.none",
         "Penetration": "spt_jax.fit.people",
         "PeopleResult": "spt_jax.fit.people",
@@ -95,6 +100,7 @@ __getattr__, __dir__ = _lazy_names(
         "Variables": "spt_jax.fit.problem.variables",
         "as_regularizer": _REGULARIZERS,
         "as_weights": f"{_REGULARIZERS}._base",
+        "fit_motion": "spt_jax.fit.motion",
         "fit_people": "spt_jax.fit.people",
         "fit_pose": "spt_jax.fit.pose",
         "joint_limits": "spt_jax.fit.problem.limits",

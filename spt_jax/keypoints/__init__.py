@@ -11,3 +11,4 @@ from spt_jax.keypoints.layouts import as_layout as as_layout
 from spt_jax.keypoints.regressor import AnyLayout as AnyLayout
 from spt_jax.keypoints.regressor import KeypointRegressor as KeypointRegressor
 from spt_jax.keypoints.regressor import keypoint_regressor as keypoint_regressor
+from spt_jax.keypoints.tracks import find_tracks as find_tracks

@@ -12,6 +12,7 @@ from spt_jax.keypoints.coco import from_annotations, from_mmpose, from_results
 from spt_jax.keypoints.confidences import CONFIDENCES
 from spt_jax.keypoints.deeplabcut import from_deeplabcut
 from spt_jax.keypoints.entries import Person
+from spt_jax.keypoints.folders import read_folder
 from spt_jax.keypoints.openpose import (
     are_frames,
     from_frames,
@@ -70,6 +71,7 @@ def read_keypoints(
     - OpenPose: a JSON object with `people`, each with `pose_keypoints_2d` of 25 or 18 keypoints,
       and with hands where anybody's were seen; or a list of them, as ControlNet writes; AlphaPose's
       two forms of it, with `people` or `bodies`, one frame or all by the names of their images.
+      A folder of such files is a sequence, one frame a file, in the order of their numbers.
     - DeepLabCut: a .csv table with one row a frame, of one or several individuals.
     - This project's: a JSON object with `layout` or `names` and `people`, a list of [x, y] or
       [x, y, confidence] each, or `points` for one person; `width` and `height` beside them. Or an
@@ -88,7 +90,7 @@ def read_keypoints(
     ears are not used. `notes` says what was left out or changed.
 
     Args:
-        path: the file, .json, .npz or .csv.
+        path: the file, .json, .npz or .csv, or a folder of OpenPose's files.
         layout: the keypoints' order, a key of `spt_jax.keypoints.LAYOUTS`, "smpl", or names with
             commas between them, for a file that does not say or says otherwise.
         map: by this package's names, what the file calls keypoints of other names:
@@ -115,7 +117,7 @@ def read_keypoints(
         >>> person.layout, person.points[0].tolist(), float(person.confidence[24])
         ('body25', [320.0, 240.0], 0.0)
     """
-    file = as_file(path, _WHAT)
+    file = Path(path) if os.path.isdir(path) else as_file(path, _WHAT)
     if map and layout is not None:
         raise ValueError("map must be left out where a layout is given: it says what names mean.")
     source = Source(file, layout, map or {}, Counter(), Counter())
@@ -131,6 +133,8 @@ def read_keypoints(
 
 
 def _people(source: Source, max_bytes: int | None) -> list[Person]:
+    if source.file.is_dir():
+        return from_frames(source, read_folder(source.file, _WHAT, max_bytes))
     if source.file.suffix.lower() == ".csv":
         limit = MAX_JSON_BYTES if max_bytes is None else max_bytes
         return from_deeplabcut(source, read_bytes(source.file, _WHAT, max_bytes=limit))

@@ -22,6 +22,7 @@ from spt_jax.cli.annotated import read_camera, select_people
 from spt_jax.cli.fitting import scenes_of
 from spt_jax.cli.main import main
 from spt_jax.fit import pose as fitting
+from spt_jax.fit import pose_prior
 from spt_jax.fit.people import Penetration, PeopleResult
 from spt_jax.fit.result import FitResult
 from spt_jax.io.pose_files import read_poses
@@ -546,3 +547,36 @@ def test_help(capsys):
     text = capsys.readouterr().out
     assert stop.value.code == 0 and "usage: spt-jax fit" in text
     assert all(word in text for word in ("--layout", "--camera", "--robust", "--quiet"))
+
+
+def test_a_folder_of_frames_becomes_a_motion_a_track(calls, tmp_path, rng, monkeypatch, capsys):
+    """Two people pass by; each frame's prior lies near the pose of the frame before."""
+    without_pictures(monkeypatch)
+    monkeypatch.setattr("spt_jax._report.intersection_report", no_overlap)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    shapes = rng.uniform(0, 100, (2, 18, 2))
+    for number in range(3):
+        people = [shapes[0] + 50 + 9 * number, shapes[1] + 400 - 9 * number][:: (-1) ** number]
+        flat = [np.concatenate([one, np.full((18, 1), 0.9)], 1).ravel().tolist() for one in people]
+        content = {"people": [{"pose_keypoints_2d": one} for one in flat]}
+        (frames / f"walk_{number}_keypoints.json").write_text(json.dumps(content))
+    out = tmp_path / "out"
+    words = ["fit", str(frames), "--out", str(out), "--frames-per-second", "25", "--fit-shape"]
+    assert main(words) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["motions"] == ["track_0.npz", "track_1.npz"]
+    for name in report["motions"]:
+        motion = read_poses(out / name)
+        assert motion.pose.shape == (3, 52, 3) and motion.frame_rate == 25
+        assert list(motion.names) == ["walk_0", "walk_1", "walk_2"]
+    # The stand-in finds the same pose each time: the next frame's prior is drawn to it.
+    usual = pose_prior(load_body().joint_names).mean
+    first, later = calls[:2], calls[2:]
+    for call in first:
+        np.testing.assert_array_equal(call["terms"].prior.mean, usual)
+        assert call["start"].fit_shape
+    for call in later:
+        drawn = np.abs(call["terms"].prior.mean[1:22])
+        assert drawn.max() < np.abs(usual[1:22]).max() and not call["start"].fit_shape
+        np.testing.assert_array_equal(call["start"].shape, np.full(10, 0.5))

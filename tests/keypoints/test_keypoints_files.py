@@ -292,8 +292,9 @@ def test_bad_archives_and_paths_are_named(tmp_path):
         read_keypoints(path)
     with pytest.raises(FileNotFoundError, match="check the spelling"):
         read_keypoints(tmp_path / "none.json")
-    with pytest.raises(ValueError, match="got the folder"):
-        read_keypoints(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"a folder of \.json files: got none"):
+        read_keypoints(tmp_path / "empty")
     (tmp_path / "binary.json").write_bytes(b"\x80\x04\x95\xff")
     with pytest.raises(ValueError, match="bytes that are no text at position 0"):
         read_keypoints(tmp_path / "binary.json")
