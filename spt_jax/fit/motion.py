@@ -77,9 +77,10 @@ def fit_motion(
 
     Each frame is fitted by `fit_pose`. Its prior is the usual one times a Gaussian about the pose
     of the frame before, whose deviation is `speed` for each angle and grows with the root of the
-    frames in between, so that depth flips do not alternate. All frames are fitted by the same
-    programs: they are compiled once. `untangle_motion` then frees the motion as a whole of what
-    collides.
+    frames in between, so that depth flips do not alternate. The place and the turn of the whole
+    body are not tied: its depth is as uncertain as in a single image, and goes some centimetres to
+    and fro. All frames are fitted by the same programs: they are compiled once. `untangle_motion`
+    then frees the motion as a whole of what collides.
 
     Args:
         body: any `BodyModel`.

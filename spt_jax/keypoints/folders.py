@@ -8,7 +8,7 @@ from spt_jax.files.limits import MAX_JSON_BYTES, check_bytes, read_json
 from spt_jax.keypoints.openpose import is_alphapose, is_openpose
 
 
-def read_folder(folder: Path, what: str, max_bytes: int | None) -> dict[str, dict[str, Any]]:
+def read_folder(folder: Path, what: str, max_bytes: int | None) -> dict[str | int, dict[str, Any]]:
     """What each .json file of a folder holds, by its name without "_keypoints".
 
     Names are in the order of their numbers: frame 2 before frame 10.
@@ -22,7 +22,7 @@ def read_folder(folder: Path, what: str, max_bytes: int | None) -> dict[str, dic
         raise ValueError(f"{what} must be a file or a folder of .json files: got none in {folder}.")
     limit = MAX_JSON_BYTES if max_bytes is None else max_bytes
     check_bytes(f"the files of {what}", folder, sum(file.stat().st_size for file in files), limit)
-    frames = {}
+    frames: dict[str | int, dict[str, Any]] = {}
     for file in files:
         content = read_json(file, what, max_bytes=max_bytes)
         if not isinstance(content, dict) or not (is_openpose(content) or is_alphapose(content)):

@@ -74,7 +74,9 @@ def test_a_run_is_smoother_as_a_motion_than_frame_by_frame():
     alone = fit_pose(body, frames, camera(), **options)
 
     def jerk(fits):
-        return np.linalg.norm(np.diff(np.asarray(fits.joints)[:, :22], 2, axis=0), axis=-1).mean()
+        joints = np.asarray(fits.joints)
+        about = joints[:, 1:22] - joints[:, :1]  # depth is no better known than in a single image
+        return np.linalg.norm(np.diff(about, 2, axis=0), axis=-1).mean()
 
     assert jerk(found.fits) < 0.7 * jerk(alone)
     off = np.linalg.norm(np.asarray(found.fits.keypoints) - points, axis=-1)
