@@ -65,8 +65,8 @@ def fit(
     or if what was found lies outside any photograph. What is done is kept in OUT/unfinished until
     all is: a run that was ended goes on with the same command.
 
-    Of any other folder each file becomes an .npz of poses, with a manifest, a summary and a report as
-    `clean` writes them; people are fitted one by one.
+    Of any other folder each file becomes an .npz of poses, with a manifest, a summary and a report
+    as `clean` writes them; people are fitted one by one.
 
     Args:
         keypoints: the file, .json, .npz or .csv, or a folder of them.
