@@ -283,3 +283,30 @@ def smplx_like():
         "kintree_table": np.array([PARENTS[55], range(55)], np.int64).astype(np.uint32),
         "f": faces.astype(np.uint32),
     }
+
+
+def cut_out(smpl, names, kept):
+    """The arrays of a file of that part of a body which some joints move, with a hole at its root.
+
+    Args:
+        smpl: the whole body's arrays.
+        names: of its joints.
+        kept: those of the part, the root first.
+    """
+    rows = [names.index(name) for name in kept]
+    owner = smpl["weights"][smpl["f"].astype(np.int64)].sum(axis=1).argmax(axis=1)
+    used, faces = np.unique(smpl["f"][np.isin(owner, rows)], return_inverse=True)
+    weights = smpl["weights"][np.ix_(used, rows)]
+    weights[:, 0] += 1 - weights.sum(axis=1)  # what is beyond the root moves with it
+    vertices, parents = smpl["v_template"][used], smpl["kintree_table"][0]
+    joints = (smpl["J_regressor"] @ smpl["v_template"])[rows]
+    tree = [-1, *(rows.index(int(parents[row])) for row in rows[1:])]
+    equations = np.column_stack([vertices, np.ones(len(vertices))]).T
+    return {
+        "v_template": vertices,
+        "shapedirs": np.zeros((len(vertices), 3, 2)),
+        "J_regressor": np.column_stack([joints, np.ones(len(rows))]) @ np.linalg.pinv(equations).T,
+        "weights": weights,
+        "kintree_table": np.array([tree, range(len(rows))], np.int64).astype(np.uint32),
+        "f": faces.reshape(-1, 3).astype(np.uint32),
+    }
