@@ -97,7 +97,7 @@ def pairs() -> dict[str, np.ndarray]:
     """By name, poses of two hands that face each other, fingers through fingers."""
     hand = left_hand()
     length = float(np.asarray(hand.template)[:, 0].max())
-    group, found = BodyGroup(hand, 2), {}
+    group, found = BodyGroup(hand, 2), {}  # type: ignore
     for reach, turn, across in _PAIRS:
         second = np.zeros((2, len(hand.joint_names), 3), np.float32)
         second[1, 0] = _facing(turn)
@@ -201,7 +201,7 @@ def main(settings: Settings) -> None:
     """Untangle all hands, print the tables, and record them where that is asked for."""
     hand = left_hand()
     one = [freed(name, hand, pose, 1) for name, pose in poses().items()]
-    group = BodyGroup(hand, 2)
+    group = BodyGroup(hand, 2)  # type: ignore
     two = [freed(name, group, pose, 2) for name, pose in pairs().items()]
     parts = [*tables(one, "One hand"), *tables(two, "Two hands")]
     for table in parts:
