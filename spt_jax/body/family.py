@@ -161,13 +161,13 @@ def _components(
     num_shape: int | None,
     num_expression: int | None,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    given = arrays["shapedirs"].astype(np.float64)
+    given = arrays["shapedirs"]
     count = given.shape[-1]
     own = layout.expressions.get(count, count)
     shapes, expressions = given[..., :own][..., :num_shape], None
     if own < count:
-        expressions = given[..., own:][..., :num_expression]
-    return shapes, expressions
+        expressions = given[..., own:][..., :num_expression].astype(np.float64)
+    return shapes.astype(np.float64), expressions
 
 
 def _hands(

@@ -28,7 +28,7 @@ def check_shape(name: str, array: np.ndarray, shape: tuple, path: Path) -> None:
         )
     # Indices are whole numbers of any size; the root's parent is 4294967295.
     if name not in ("f", "kintree_table") and array.size:
-        largest = float(np.abs(array.astype(np.float64)).max())
+        largest = max(float(array.max()), -float(array.min()))
         if largest > _LARGEST:
             raise ValueError(
                 f"{name} in {path} must be within {_LARGEST:g} of zero, in metres or as a share: "
