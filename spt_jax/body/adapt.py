@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spt_jax.body.adapted import MATRICES, TURN, AdaptedBody
+from spt_jax.body.adapted import TURN, AdaptedBody
 from spt_jax.body.function_body import FunctionBody, body_of_function
+from spt_jax.body.model_rotations import MATRICES
 
 
 @overload

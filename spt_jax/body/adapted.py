@@ -1,7 +1,6 @@
 """Bodies of the package body-models as bodies of this one."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -14,14 +13,9 @@ from spt_jax.body import poses
 from spt_jax.body.base import AbstractBody, PosedBody, broadcast_batches, floating
 from spt_jax.body.fold_distances import fold_distances
 from spt_jax.body.model_check import checked_rows
-from spt_jax.body.rotations import matrix_from_axis_angle
+from spt_jax.body.model_rotations import MATRICES, as_rotation, as_written, axis_of
 from spt_jax.rest.surface import RestSurface
 
-# Axis angles of body-models have no derivative at zero (version 0.26): a millionth of a radian in
-# place of none turns nothing that could be seen.
-_NO_TURN, _HARDLY = 1e-12, 1e-6
-
-MATRICES = ("rotmat", "matrix")
 TURN, _PLACE = "global_rotation", "global_translation"
 
 
@@ -215,8 +209,8 @@ class AdaptedBody(AbstractBody):
                 rows.append(jnp.zeros(3))
                 continue
             value = floating(name, parameters[name])
-            value = value if self._is_single(name) else jnp.moveaxis(value, _axis(kind), 0)[k]
-            with _as_written():
+            value = value if self._is_single(name) else jnp.moveaxis(value, axis_of(kind), 0)[k]
+            with as_written():
                 rows.append(SO3.convert(value, src=kind, dst="axis_angle", xp=jnp))  # type: ignore
         batch = jnp.broadcast_shapes(*(row.shape for row in rows))
         return jnp.stack([jnp.broadcast_to(row, batch) for row in rows], axis=-2)
@@ -263,7 +257,7 @@ class AdaptedBody(AbstractBody):
             found[name] = pose[..., start : start + size]
             start += size
         rest = jnp.zeros((*pose.shape[:-1], 3), pose.dtype)
-        return found | {TURN: _as_rotation(rest, self._spec[TURN].rotation_type)}
+        return found | {TURN: as_rotation(rest, self._spec[TURN].rotation_type)}
 
     def _turns(self, pose, kind: str | None) -> dict[str, Array]:
         rows: dict[str, list[tuple[int, int]]] = {}
@@ -273,11 +267,11 @@ class AdaptedBody(AbstractBody):
         for name in (name for name, spec in self._spec.items() if spec.rotation_type is not None):
             own = kind or self._spec[name].rotation_type
             if name not in rows:  # the model's root has a rotation of its own
-                found[name] = _as_rotation(jnp.zeros_like(pose[..., 0, :]), own)
+                found[name] = as_rotation(jnp.zeros_like(pose[..., 0, :]), own)
                 continue
             chosen = np.array([row for _, row in sorted(rows[name])])
-            turned = _as_rotation(pose[..., chosen, :], own)
-            found[name] = jnp.squeeze(turned, _axis(own)) if self._is_single(name) else turned
+            turned = as_rotation(pose[..., chosen, :], own)
+            found[name] = jnp.squeeze(turned, axis_of(own)) if self._is_single(name) else turned
         return found
 
 
@@ -292,35 +286,13 @@ def _parents_first(parents: tuple[int, ...]) -> list[int]:
     return sorted(range(len(parents)), key=lambda joint: (depth[joint], joint))
 
 
-def _axis(kind: str) -> int:
-    return -3 if kind in MATRICES else -2
-
-
 # Compiled as a whole: one by one the model's operations take half a minute the first time.
 @eqx.filter_jit
 def _posed(body: AdaptedBody, pose, shape, translation) -> PosedBody:
     given = body.arguments(pose, shape, translation)
-    with _as_written():
+    with as_written():
         vertices = body.model.forward_vertices(**given)
         skeleton = body.model.forward_skeleton(**given)
     if body.only is not None:
         vertices = vertices[..., body.only, :]
     return PosedBody(vertices, skeleton[..., :3, 3])
-
-
-def _as_rotation(vectors: Float[Array, "*batch 3"], kind: str) -> Float[Array, "..."]:
-    if kind in MATRICES:
-        return matrix_from_axis_angle(vectors)
-    from nanomanifold import SO3
-
-    none = jnp.sum(vectors**2, axis=-1, keepdims=True) < _NO_TURN
-    vectors = jnp.where(none, vectors + _HARDLY, vectors)
-    with _as_written():
-        return SO3.convert(vectors, src="axis_angle", dst=kind, xp=jnp)  # type: ignore
-
-
-@contextmanager
-def _as_written() -> Iterator[None]:
-    """Shapes and dtypes promote as the packages expect it, whatever the caller has set."""
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        yield

@@ -42,6 +42,28 @@ def target_names(mesh: dict[str, Any]) -> list[str]:
     return [str(named[k]) if k < len(named) else f"target {k}" for k in range(count)]
 
 
+def default_weights(document: Document) -> dict[int, np.ndarray]:
+    """Of each node with morph targets, the coefficients that the file gives them.
+
+    Raises:
+        UnreadableError: one is not finite.
+    """
+    found = {}
+    for number, node in enumerate(document.items("nodes")):
+        if "mesh" not in node:
+            continue
+        mesh = document.item("meshes", node["mesh"], f"the mesh of node {number}")
+        count = len(target_names(mesh))
+        given = node.get("weights", mesh.get("weights", []))
+        if count:
+            values = np.zeros(count)
+            values[: len(given)] = np.asarray(given, np.float64)[:count]
+            if not np.isfinite(values).all():
+                raise UnreadableError(f"the weights of node {number} must be finite")
+            found[number] = values
+    return found
+
+
 def read_primitives(
     document: Document, mesh: int, bones: int | None, notes: list[str]
 ) -> Iterator[Primitive]:

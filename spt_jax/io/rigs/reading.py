@@ -20,7 +20,7 @@ from spt_jax.io.rigs.characters import find_characters, read_skins
 from spt_jax.io.rigs.clips import Clip, sample
 from spt_jax.io.rigs.document import SUFFIXES, WHAT, Document, open_document
 from spt_jax.io.rigs.nodes import read_nodes
-from spt_jax.io.rigs.primitives import target_names
+from spt_jax.io.rigs.primitives import default_weights
 from spt_jax.io.rigs.rewriting import with_animation
 
 
@@ -252,7 +252,7 @@ def _read(file: Path, scale: float | None, dtype: np.dtype, max_bytes: int | Non
     document = open_document(file, max_bytes)
     nodes, common = read_nodes(document), []
     skins = read_skins(document, nodes)
-    weights = _weights(document)
+    weights = default_weights(document)
     counts = {node: len(values) for node, values in weights.items()}
     animations = read_animations(document, len(nodes.names), counts, common)
     moved = {c.node for a in animations for c in a.channels if c.path != "weights"}
@@ -288,21 +288,3 @@ def _read(file: Path, scale: float | None, dtype: np.dtype, max_bytes: int | Non
 
 def _moves(animation: Animation, built: Built) -> bool:
     return any(c.node in built.joints.place or c.node in built.targets for c in animation.channels)
-
-
-def _weights(document: Document) -> dict[int, np.ndarray]:
-    """Of each node with morph targets, the coefficients that the file gives them."""
-    found = {}
-    for number, node in enumerate(document.items("nodes")):
-        if "mesh" not in node:
-            continue
-        mesh = document.item("meshes", node["mesh"], f"the mesh of node {number}")
-        count = len(target_names(mesh))
-        given = node.get("weights", mesh.get("weights", []))
-        if count:
-            values = np.zeros(count)
-            values[: len(given)] = np.asarray(given, np.float64)[:count]
-            if not np.isfinite(values).all():
-                raise UnreadableError(f"the weights of node {number} must be finite")
-            found[number] = values
-    return found
