@@ -410,7 +410,7 @@ def test_a_body_with_a_hole_is_shown_with_a_note_and_an_edit_ends_a_search(tmp_p
     np.savez(tmp_path / "holed.npz", **arrays | {"f": arrays["f"][1:]})
     view = View(tmp_path / "holed.npz", port=18_775)
     try:
-        assert len(view._notes) == 1 and "boundary" in view._notes[0]
+        assert len(view._notes) == 1 and "closed by fans" in view._notes[0]
         view._untangling = True  # as while a search runs
         view._do("through", "see_through", False)
         assert not view._stop.is_set()
