@@ -116,7 +116,12 @@ def fit(
     if keypoints.is_dir() and not sequence:
         with user_errors():
             seen = folder_camera(camera, focal, center, max_bytes)
-            refuse_for_folder(image=image is not None, people=people != "all", together=together)
+            refuse_for_folder(
+                image=image is not None,
+                people=people != "all",
+                together=together,
+                map=names is not None,
+            )
         from spt_jax.datasets import fit as start_fit
 
         return over_folder(

@@ -580,3 +580,9 @@ def test_a_folder_of_frames_becomes_a_motion_a_track(calls, tmp_path, rng, monke
         drawn = np.abs(call["terms"].prior.mean[1:22])
         assert drawn.max() < np.abs(usual[1:22]).max() and not call["start"].fit_shape
         np.testing.assert_array_equal(call["start"].shape, np.full(10, 0.5))
+
+
+def test_a_map_is_not_dropped_where_a_folder_is_a_data_set(tmp_path, capsys):
+    (tmp_path / "a.json").write_text("[]")
+    assert main(["fit", str(tmp_path), "--out", str(tmp_path / "out"), "--map", "nose=snout"]) == 2
+    assert "map is for a single file: got it with a folder" in capsys.readouterr().err
