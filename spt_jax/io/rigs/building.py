@@ -140,9 +140,9 @@ def _assemble(document, nodes, skins, character: Character, joints: Joints, note
             linear = to_world[:3, :3]
             mesh.vertices[rows] = primitive.vertices @ linear.T + to_world[:3, 3]
             across = np.array(places)[primitive.joints]
-            np.add.at(
-                mesh.weights, (np.arange(start, rows.stop)[:, None], across), primitive.weights
-            )
+            vertex = np.arange(start, rows.stop)
+            for k in range(across.shape[1]):  # a vertex may name a joint twice
+                mesh.weights[vertex, across[:, k]] += primitive.weights[:, k]
             first = targets.get(part.node, 0)
             for k, moved in enumerate(primitive.targets):
                 mesh.targets[rows, :, first + k] = moved @ linear.T

@@ -58,7 +58,8 @@ def welded(mesh: Mesh, notes: list[str]) -> Mesh:
     faces = rows[mesh.faces]
     gone = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     weights = mesh.weights[kept]
-    apart = np.abs(mesh.weights - weights[rows]).max(axis=1, initial=0.0)
+    joined = np.flatnonzero(kept[rows] != np.arange(len(rows)))
+    apart = np.abs(mesh.weights[joined] - weights[rows[joined]]).max(axis=1, initial=0.0)
     if (apart > _SAME).any():
         notes.append(
             f"where parts meet {int((apart > _SAME).sum())} vertices have weights that differ by "
@@ -88,7 +89,8 @@ def _leaders(mesh: Mesh, group: Int[np.ndarray, "V"]) -> Int[np.ndarray, "V"]:
     """Of each vertex the first one of its group that is skinned and morphed as it is."""
     allowed = _TARGETS * max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-12)
     leader = np.arange(len(group))
-    left = leader
+    # Nearly all are alone.
+    left = np.flatnonzero(np.bincount(group)[group] > 1)
     while len(left):
         _, first, of = np.unique(group[left], return_index=True, return_inverse=True)
         head = left[first][of]
