@@ -214,7 +214,7 @@ class _Search:
         vertices: np.ndarray,
         sampling: Sampling,
         on_step: OnStep,
-        fixed: np.ndarray | None,
+        fixed: np.ndarray | None = None,
     ):
         self.surface, self.sampling, self.on_step = surface, sampling, on_step
         self.dtype = vertices.dtype
