@@ -22,7 +22,7 @@ from spt_jax.body import load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.io.mesh_files import read_mesh
 from spt_jax.io.pose_files import load_poses, read_poses
-from spt_jax.keypoints import read_keypoints
+from spt_jax.keypoints import LAYOUTS, read_keypoints
 from spt_jax.show.overlay import read_image
 
 # The tests' own writers: a module beside no package, so that it is found by its path.
@@ -311,8 +311,10 @@ def _body_pkl(rng: Generator) -> Written:
 
 
 def _keypoints(rng: Generator) -> Written:
-    way = ("coco", "results", "mmpose", "openpose", "own")[rng.integers(5)]
-    count, people = 25 if way == "openpose" else 17, int(rng.integers(1, 4))
+    ways = ("coco", "results", "mmpose", "openpose", "alphapose", "names", "own")
+    way = ways[rng.integers(len(ways))]
+    people = int(rng.integers(1, 4))
+    count = {"openpose": 25, "alphapose": 18}.get(way, 17)
     points = rng.uniform(1, 400, (people, count, 2)).round(2)
     trust = rng.choice([0.0, 0.5, 1.0], (people, count), p=[0.2, 0.3, 0.5])
     trust[:, :4] = 1.0
@@ -334,9 +336,29 @@ def _keypoints(rng: Generator) -> Written:
         content = {"instance_info": [{"frame_id": 1, "instances": scores}]}
     elif way == "openpose":
         content = {"version": 1.3, "people": [{"pose_keypoints_2d": row} for row in flat]}
+    elif way == "alphapose":
+        content = {"a.jpg": {"version": "0.3", "bodies": [{"joints": row} for row in flat]}}
+    elif way == "names":
+        names = rng.permutation(LAYOUTS["coco17"].names).tolist()
+        content = {"names": names, "people": rows.tolist(), **unknown}
     else:
         content = {"layout": "coco17", "people": rows.tolist(), **unknown}
     return Written(as_json(rng, content), truth, content)
+
+
+def _keypoint_table(rng: Generator) -> Written:
+    """A table of DeepLabCut's."""
+    names = rng.permutation(LAYOUTS["coco17"].names)[: int(rng.integers(2, 17))].tolist()
+    frames = int(rng.integers(1, 5))
+    points = rng.uniform(1, 400, (frames, len(names), 2)).round(2)
+    trust = rng.choice([0.5, 0.75, 1.0], (frames, len(names)))
+    rows = np.concatenate([points, trust[..., None]], axis=-1).reshape(frames, -1)
+    head = [["scorer", *["net"] * rows.shape[1]]]
+    head.append(["bodyparts", *(name for name in names for _ in range(3))])
+    head.append(["coords", *("x", "y", "likelihood") * len(names)])
+    lines = [",".join(row) for row in head]
+    lines += [",".join(map(str, (k, *row))) for k, row in enumerate(rows.tolist())]
+    return Written("\n".join([*lines, ""]).encode(), [points, trust])
 
 
 def _keypoint_arrays(rng: Generator) -> Written:
@@ -428,6 +450,9 @@ FORMATS = {
     "body, npz": Format(".npz", _body_npz, _read_body, summed=True),
     "body, pickle": Format(".pkl", _body_pkl, _read_body),
     "keypoints, JSON": Format(".json", _keypoints, _read_keypoints),
+    "keypoints, DeepLabCut": Format(
+        ".csv", _keypoint_table, _read_keypoints, text=True, counted=False
+    ),
     "keypoints, npz": Format(".npz", _keypoint_arrays, _read_keypoints, summed=True),
     "image": Format(".img", _image, lambda path: [read_image(path)], counted=False),
 }

@@ -62,6 +62,12 @@ def from_deeplabcut(source: Source, content: bytes) -> list[Person]:
 def _rows(source: Source, content: bytes) -> list[list[str]]:
     try:
         text = content.decode("utf-8-sig")
+        if text and not text.endswith(("\n", "\r")):
+            # A number of which digits are missing is a number, too.
+            raise ValueError(
+                f"{source.file} must end with the end of a line: got {shown(text[-12:])}; it is "
+                "cut, or if it is whole, add one."
+            )
         return [row for row in csv.reader(text.splitlines()) if row]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{source.file} must be a table of text: got {error}.") from error
