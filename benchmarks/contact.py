@@ -66,7 +66,7 @@ def _pair(divisions: int, place, aside=_ASIDE) -> tuple[Mesh, Mesh]:
 
 
 def _loose(count: int) -> Mesh:
-    """Boxes in each other at random, each with its six neighbours and some of the others."""
+    """Boxes in each other at random, each with its six neighbors and some of the others."""
     random, side = np.random.default_rng(0), round(count ** (1 / 3))
     places = np.stack(np.meshgrid(*[np.arange(side)] * 3), axis=-1).reshape(-1, 3)
     shifted = places + random.uniform(-0.1, 0.1, places.shape)

@@ -312,7 +312,7 @@ def roughness(volumes: Sequence[float]) -> tuple[float, float, float, float]:
     """The median step and the largest, their ratio, and the largest jump as a part of the volume.
 
     Steps are those during which there is a volume. A jump is what a step has that the mean of its
-    neighbours has not: a volume that falls smoothly to nothing has steps of very different sizes,
+    neighbors has not: a volume that falls smoothly to nothing has steps of very different sizes,
     and no jump.
     """
     volume = np.array(volumes)

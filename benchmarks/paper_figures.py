@@ -73,7 +73,7 @@ def single_tables(singles: Singles) -> list[Table]:
     tables = []
     for key, title in (
         (("Eq. 10", RATE), "Figure 5: unit gradient (Eq. 10), rate 1e-4; value (Eq. 11)"),
-        (("Eq. 9", RATE), "Figure 6: not normalised (Eq. 9), rate scaled to the same first step"),
+        (("Eq. 9", RATE), "Figure 6: not normalized (Eq. 9), rate scaled to the same first step"),
     ):
         rows = []
         for iteration in LISTED:
@@ -222,7 +222,7 @@ def _reading(singles: Singles, pairs: Pairs) -> str:
   lower. It starts worse (the average rises at first) and bends the bodies further: after 300
   iterations the poses have moved by {_moved(area):.2f} rad on average (norm over all joints), with
   Eq. 10 by {_moved(unit):.2f}. At a hundred times the rate it is Eq. 10 that jumps. That
-  normalising makes the descent stable is therefore not reproduced as a rule.
+  normalizing makes the descent stable is therefore not reproduced as a rule.
 - Neither gradient is in balance: both turn the whole body (last column), which removes no
   self-intersection, and free places drift ({drift.max():.2f} m in 100 iterations), although the
   two bodies overlap by no more than 2 cm3 from iteration 10 on.

@@ -58,7 +58,7 @@ def exact(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> 
 
     # Divergence theorem with x / 3: each piece bounds the levels that differ by `kind` across it.
     volume = kind @ np.einsum("ki,ki->k", corner[:, 0] - vertices.mean(axis=0), normal) / 6
-    # lambda is affine, so its integral over a piece is the value at the centre times the area.
+    # lambda is affine, so its integral over a piece is the value at the center times the area.
     weight = _barycentric(vertices[faces[origin]], center)
     force = (kind[:, None] * weight)[:, :, None] * (normal / 2)[:, None, :]
     gradient = np.zeros_like(vertices)

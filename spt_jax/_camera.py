@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 _SKEW = 1e-3
 _ORTHONORMAL = 1e-3
 # Of the rows of a 3 x 3 matrix scaled to length 1; a focal length of a millionth of the distance
-# from the image to its centre gives 1e-12, float32 rounding of a singular matrix 1e-7.
+# from the image to its center gives 1e-12, float32 rounding of a singular matrix 1e-7.
 _SINGULAR = 1e-7
 
 
@@ -163,7 +163,7 @@ class PinholeCamera(eqx.Module):
         habit of taking the image's diagonal for the focal length (45 over the longer side of
         3 : 2). The habit of 5000 pixels, 12 degrees or less, puts people 20 to 60 m away, where no
         perspective is left to tell an arm in front from one behind. For an image cut out of
-        another, take the whole one's width and height, and move the centre.
+        another, take the whole one's width and height, and move the center.
 
         Args:
             width, height: of the image, in pixels.
@@ -171,7 +171,7 @@ class PinholeCamera(eqx.Module):
             near: as the class says.
 
         Returns:
-            A PinholeCamera with equal focal lengths and the image's middle as its centre.
+            A PinholeCamera with equal focal lengths and the image's middle as its center.
 
         Raises:
             TypeError, ValueError: sizes that are not positive numbers, an angle that is not above 0
@@ -327,7 +327,7 @@ def _decompose(
 ) -> tuple[
     Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]
 ]:
-    """Focal lengths, centre, rotation and translation of a finite projection matrix."""
+    """Focal lengths, center, rotation and translation of a finite projection matrix."""
     left = matrix[:, :3]
     # Rows scaled by themselves: the pixels' unit and the matrix's scale say nothing about its rank.
     lengths = np.abs(left).max(axis=1, keepdims=True)

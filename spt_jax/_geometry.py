@@ -37,7 +37,7 @@ def inflate(
     Returns:
         The moved vertices, in the dtype of `vertices`. A vertex without a normal stays: one that no
         triangle uses, or only triangles without an area, or whose normals cancel. A vertex
-        that is not finite stays so and is taken as the origin by its neighbours.
+        that is not finite stays so and is taken as the origin by its neighbors.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`, for vertices and faces.

@@ -146,7 +146,7 @@ def part_groups(weights: Any, faces: Any) -> Int[np.ndarray, "F"]:
     return mean.argmax(axis=1).astype(np.int32)
 
 
-def neighbour_pairs(parents: Sequence[int]) -> Pairs:
+def neighbor_pairs(parents: Sequence[int]) -> Pairs:
     """Each joint with itself and with its parent: the parts that skinning makes overlap.
 
     SMPLify-X leaves these out, and a few more that its settings name one by one.
@@ -155,8 +155,8 @@ def neighbour_pairs(parents: Sequence[int]) -> Pairs:
         parents: the parent of each joint, -1 for a root.
 
     Example:
-        >>> from spt_jax._groups import neighbour_pairs
-        >>> neighbour_pairs((-1, 0, 0))
+        >>> from spt_jax._groups import neighbor_pairs
+        >>> neighbor_pairs((-1, 0, 0))
         ((0, 0), (0, 1), (0, 2), (1, 1), (2, 2))
     """
     own = within_groups(len(parents))

@@ -111,10 +111,10 @@ class MeshCheck:
     def __rich__(self):
         from rich.text import Text
 
-        colours = {"problem": "red", "warning": "yellow"}
+        colors = {"problem": "red", "warning": "yellow"}
         text = Text(self._headline(), style="green" if self.ok else "red")
         for mark, line in self._lines():
-            text.append(f"\n  {mark} ", style=colours[mark.rstrip(":")])
+            text.append(f"\n  {mark} ", style=colors[mark.rstrip(":")])
             text.append(line, style="default")
         return text
 

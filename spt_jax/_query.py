@@ -137,7 +137,7 @@ def as_directions(directions: Any) -> Directions:
         if not np.isfinite(row).all() or not np.abs(row).max() > 0:
             raise ValueError(
                 f"directions must be finite and not zero: got {row.tolist()} in row {k}; lengths "
-                "do not matter, they are normalised."
+                "do not matter, they are normalized."
             )
     # Scaling by the largest component first keeps tiny and huge vectors from under- or overflowing.
     rows = rows / np.abs(rows).max(axis=1, keepdims=True)

@@ -54,7 +54,7 @@ def sphere(radius=1.0, center=(0.0, 0.0, 0.0), subdivisions=4) -> Mesh:
 
 
 def lens_volume(distance: float, radius: float = 1.0) -> float:
-    """Intersection of two equal spheres whose centres are `distance` apart."""
+    """Intersection of two equal spheres whose centers are `distance` apart."""
     return np.pi * (4 * radius + distance) * (2 * radius - distance) ** 2 / 12
 
 

@@ -16,7 +16,7 @@ def exact_overlap(mesh: Mesh) -> tuple[float, np.ndarray]:
     """Volume and gradient, with CGAL's cuts and libigl's winding numbers.
 
     On every piece w_out is constant, so the divergence theorem gives the integral of w (w - 1) / 2,
-    and w_out times the corner's weight at the piece's centre the gradient.
+    and w_out times the corner's weight at the piece's center the gradient.
     """
     vertices, faces = mesh
     cut, pieces, _, origin, *_ = cgal.remesh_self_intersections(vertices, faces, cutoff=_NO_CUTOFF)

@@ -10,7 +10,7 @@ from spt_jax import self_intersection_penalty
 from spt_jax._groups import (
     between_groups,
     join_bodies,
-    neighbour_pairs,
+    neighbor_pairs,
     part_groups,
     within_groups,
 )
@@ -24,10 +24,10 @@ def test_parts_are_where_their_joints_are():
     for face in range(0, len(faces), 501):
         mean = weights[faces[face]].mean(axis=0)
         assert mean[groups[face]] == pytest.approx(mean.max())
-    centre = np.asarray(body.template)[faces].mean(axis=1)
+    center = np.asarray(body.template)[faces].mean(axis=1)
     for name in ("head", "left_wrist", "right_wrist", "left_foot", "right_knee", "left_elbow"):
         joint = body.joint_names.index(name)
-        mine = centre[groups == joint]
+        mine = center[groups == joint]
         assert len(mine) > 50
         # Its own joint or a child's is the nearest to most of a part.
         nearest = np.linalg.norm(mine[:, None] - np.asarray(body.joint_template), axis=2).argmin(1)
@@ -40,12 +40,12 @@ def test_ties_take_the_first_joint():
     np.testing.assert_array_equal(part_groups(weights, np.array([[0, 1, 2]])), [0])
 
 
-def test_neighbours_are_every_parent_and_child():
+def test_neighbors_are_every_parent_and_child():
     body = embedded_body()
-    pairs = body.neighbour_pairs
+    pairs = body.neighbor_pairs
     assert len(pairs) == len(set(pairs)) == 52 + 51
     assert all(a == b or body.parents[b] == a for a, b in pairs)
-    assert neighbour_pairs((-1,)) == ((0, 0),)
+    assert neighbor_pairs((-1,)) == ((0, 0),)
 
 
 def test_pairs_split_into_within_and_between():

@@ -139,7 +139,7 @@ def test_faces_listed_twice_count_by_their_winding_number(dtype, rays):
     run = jax.value_and_grad(lambda v: self_intersection_penalty(v, twice, rays=rays))
     value, gradient = run(jnp.asarray(vertices, dtype))
     assert float(value) == pytest.approx(1.0, rel=1e-5 if rays is None else 0.05)
-    # Of a volume V: stretched by s about the centre it grows with 3 V.
+    # Of a volume V: stretched by s about the center it grows with 3 V.
     stretched = float((gradient * vertices.astype(dtype)).sum())
     assert stretched == pytest.approx(3.0, rel=1e-5 if rays is None else 0.05)
 

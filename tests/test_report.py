@@ -205,7 +205,7 @@ def test_an_empty_mesh_is_fit_and_says_so():
     assert report.volume == report.ratio == report.solid_volume == 0 and str(report)
 
 
-def test_the_check_prints_in_colour():
+def test_the_check_prints_in_color():
     from rich.console import Console
 
     vertices, faces = box()

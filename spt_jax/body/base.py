@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from spt_jax._groups import Pairs, neighbour_pairs, part_groups
+from spt_jax._groups import Pairs, neighbor_pairs, part_groups
 from spt_jax.body import poses
 from spt_jax.rest.surface import RestSurface
 
@@ -97,7 +97,7 @@ class AbstractBody(eqx.Module):
     def part_groups(self) -> Int[np.ndarray, "F"]:
         """Of each face, the joint that moves it most (`joint_names` says which).
 
-        By the mean skinning weight over its corners. With `ignore_groups=body.neighbour_pairs`,
+        By the mean skinning weight over its corners. With `ignore_groups=body.neighbor_pairs`,
         overlaps of parts that meet at a joint do not count.
 
         Raises:
@@ -112,15 +112,15 @@ class AbstractBody(eqx.Module):
         return part_groups(self.weights, self.faces)
 
     @property
-    def neighbour_pairs(self) -> Pairs:
+    def neighbor_pairs(self) -> Pairs:
         """Each part with itself and with its parent's, as pairs of joints for `ignore_groups`.
 
         Example:
             >>> from spt_jax.body import load_body
-            >>> (4, 7) in load_body().neighbour_pairs  # left knee, left ankle
+            >>> (4, 7) in load_body().neighbor_pairs  # left knee, left ankle
             True
         """
-        return neighbour_pairs(self.parents)
+        return neighbor_pairs(self.parents)
 
     def pose_from_smpl(self, pose: Float[Array | np.ndarray, "..."]) -> Float[Array, "*batch J 3"]:
         """This body's pose from a pose of 22, 24 (SMPL), 52 (SMPL-H) or 55 (SMPL-X) joints.

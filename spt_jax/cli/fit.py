@@ -58,7 +58,7 @@ def fit(
     Takes COCO's annotations and results, what MMPose, AlphaPose, Detectron2, Ultralytics and
     OpenPose write as JSON, DeepLabCut's tables, and JSON or .npz files of this project
     ({"layout", "people": [[[x, y, confidence], ...], ...]}). Writes poses.npz (AMASS layout), a
-    .glb of each person coloured by label, a picture of each image with the bodies over it, and
+    .glb of each person colored by label, a picture of each image with the bodies over it, and
     report.json. A folder of OpenPose's frames (NAME_NUMBER_keypoints.json) is a sequence: people
     are followed from frame to frame, stay near the pose that they had, and are written as a motion
     each (track_0.npz, ...). The exit code is 1 if somebody could not be fitted,

@@ -131,7 +131,7 @@ def people_table(people: Sequence[Fitted]) -> "Table":
         if one.overlap is None:
             table.add_row(escape(one.name), f"[red]{_short(one)}[/red]", str(len(one.errors)))
             continue
-        colour = "green" if one.overlap.volume == 0 else "default"
+        color = "green" if one.overlap.volume == 0 else "default"
         table.add_row(
             escape(one.name),
             f"[red]{_short(one)}[/red]" if one.outside else _short(one),
@@ -139,8 +139,8 @@ def people_table(people: Sequence[Fitted]) -> "Table":
             f"{np.median(one.errors):.1f}",
             f"{one.errors.max():.1f}",
             f"{one.distance:.2f}",
-            f"[{colour}]{one.overlap.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
-            f"[{colour}]{one.overlap.intersecting_pairs}[/{colour}]",
+            f"[{color}]{one.overlap.volume * _CUBIC_CENTIMETRES:.2f}[/{color}]",
+            f"[{color}]{one.overlap.intersecting_pairs}[/{color}]",
         )
     return table
 

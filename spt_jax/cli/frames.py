@@ -164,15 +164,15 @@ def before_after_table(frames: Sequence[Frame]) -> "Table":
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     for frame in frames:
-        colour = "green" if frame.after.volume < 0.01 * frame.before.volume else "default"
+        color = "green" if frame.after.volume < 0.01 * frame.before.volume else "default"
         table.add_row(
             escape(frame.name),
             f"{frame.before.ratio:.2%}",
-            f"[{colour}]{frame.after.ratio:.2%}[/{colour}]",
+            f"[{color}]{frame.after.ratio:.2%}[/{color}]",
             f"{frame.before.volume * _CUBIC_CENTIMETRES:.2f}",
-            f"[{colour}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f}[/{colour}]",
+            f"[{color}]{frame.after.volume * _CUBIC_CENTIMETRES:.2f}[/{color}]",
             str(frame.before.intersecting_pairs),
-            f"[{colour}]{frame.after.intersecting_pairs}[/{colour}]",
+            f"[{color}]{frame.after.intersecting_pairs}[/{color}]",
             str(frame.steps),
             f"{frame.seconds:.1f} s",
         )
@@ -240,7 +240,7 @@ def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -
 def write_meshes(
     folder: Path, frames: Sequence[Frame], faces: Any, suffixes: Sequence[str]
 ) -> list[str]:
-    """Write each frame's meshes before and after, coloured by label; return the files' names."""
+    """Write each frame's meshes before and after, colored by label; return the files' names."""
     from spt_jax.io.mesh_files import write_mesh
 
     names, written = _file_names(frames), []

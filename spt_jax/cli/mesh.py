@@ -82,7 +82,7 @@ def untangle_mesh_file(
             written = opened.write(folder / report["mesh"], result.vertices)
             report["notes"] = [*notes, *written]
             report["meshes"] = (
-                _write_coloured(folder, path.stem, given, result.vertices, faces, rays)
+                _write_colored(folder, path.stem, given, result.vertices, faces, rays)
                 if meshes
                 else []
             )
@@ -147,8 +147,8 @@ def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
     for heading in ("", "before", "after"):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     before, after = result.before, result.after
-    colour = "green" if result.is_free else "red"
-    left = f"[{colour}]{after.intersecting_pairs}[/{colour}]"
+    color = "green" if result.is_free else "red"
+    left = f"[{color}]{after.intersecting_pairs}[/{color}]"
     table.add_row("intersecting pairs", f"{before.intersecting_pairs}", left)
     table.add_row("overlap, units³", f"{before.volume:.4g}", f"{after.volume:.4g}")
     table.add_row("vertices in overlap", f"{before.ratio:.2%}", f"{after.ratio:.2%}")
@@ -161,7 +161,7 @@ def _table(result: "UntangleMeshResult", seconds: float) -> "Table":
     return table
 
 
-def _write_coloured(
+def _write_colored(
     folder: Path,
     stem: str,
     before: Float[np.ndarray, "V 3"],

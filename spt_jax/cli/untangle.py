@@ -66,7 +66,7 @@ def untangle(
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
             0.04 on fingers.
-        meshes: write a .glb of each frame before and after, coloured by label.
+        meshes: write a .glb of each frame before and after, colored by label.
         like_input: write NAME_untangled too, the input in its own structure with the new poses.
         together: the people of a file as one scene a frame: freed of themselves and of each other,
             which also moves them as a whole; what is between and within them is counted apart.

@@ -18,7 +18,7 @@ def view(
 ) -> int:
     """Look at a body or a mesh in the browser, bend it, and watch it being untangled.
 
-    Joints turn by sliders or by rings in the picture; vertices in self-intersection are coloured,
+    Joints turn by sliders or by rings in the picture; vertices in self-intersection are colored,
     and volume, ratio and milliseconds are shown as you drag. Ends with Ctrl-C.
 
     Args:

@@ -146,7 +146,7 @@ class Inflated:
         at = corners.ravel()
         of_direction += np.stack([np.bincount(at, (of_cosine * n).ravel(), count) for n in normal])
         of_normal = (of_cosine * self._direction[:, corners]).sum(axis=1)
-        # The direction is the normalised sum of angle times normal.
+        # The direction is the normalized sum of angle times normal.
         across = of_direction - self._direction * (self._direction * of_direction).sum(axis=0)
         of_sum = across / np.where(self._length > 0, self._length, np.inf)
         of_sum = of_sum[:, corners] * hit

@@ -58,7 +58,7 @@ def connected(
     """The lowest member of each item's component, where links join `first` to `second`."""
     label = np.arange(count)
     while True:
-        # Every root moves under its lowest neighbour, then every path is shortened to its root.
+        # Every root moves under its lowest neighbor, then every path is shortened to its root.
         a, b = label[first], label[second]
         apart = a != b
         if not apart.any():

@@ -38,7 +38,7 @@ def render_arrows(
         vertices: positions, in any unit.
         faces: vertex indices, counter-clockwise seen from outside.
         vectors: one for each vertex; where it is zero there is no arrow.
-        labels: 0, +1 or -1 for each vertex, coloured as in `render_mesh`.
+        labels: 0, +1 or -1 for each vertex, colored as in `render_mesh`.
         most: about how many arrows at most: of those near each other that point the same way the
             longest stays.
         close_up: look at the vertices with arrows, not at the whole mesh.
@@ -148,8 +148,8 @@ def _draw_arrows(
     drawn = plotter.screenshot(return_img=True, transparent_background=True).astype(np.float64)
     width, height = size
     blocks = drawn.reshape(height, OVERSAMPLING, width, OVERSAMPLING, 4)
-    # Colours weighed by their opacity, or edges would take on the colour of nothing.
+    # Colors weighed by their opacity, or edges would take on the color of nothing.
     weight = blocks[..., 3:]
     total = weight.sum(axis=(1, 3))
-    colour = (blocks[..., :3] * weight).sum(axis=(1, 3)) / np.where(total > 0, total, 1)
-    return np.concatenate([colour, total / OVERSAMPLING**2], axis=2)
+    color = (blocks[..., :3] * weight).sum(axis=(1, 3)) / np.where(total > 0, total, 1)
+    return np.concatenate([color, total / OVERSAMPLING**2], axis=2)

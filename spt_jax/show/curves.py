@@ -8,7 +8,7 @@ import numpy as np
 
 from spt_jax.show.look import CURVES, INK, Picture, blank_figure, check_png, drawn, dress, finished
 
-# Past the colours, curves differ by their dashes.
+# Past the colors, curves differ by their dashes.
 _DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)))
 
 

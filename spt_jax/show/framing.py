@@ -91,9 +91,9 @@ def frame(
 def marked_triangles(
     labels: Int[np.ndarray, "V"], faces: Int[np.ndarray, "F 3"]
 ) -> Bool[np.ndarray, "F"]:
-    """The triangles to colour: all corners labelled, or one that no such triangle shows.
+    """The triangles to color: all corners labelled, or one that no such triangle shows.
 
-    The triangle rule labels every corner of a crossed triangle; colouring each triangle with one
+    The triangle rule labels every corner of a crossed triangle; coloring each triangle with one
     labelled corner would add another ring around what is already the outermost.
     """
     labelled = labels != 0

@@ -1,4 +1,4 @@
-"""The one look of all pictures: colours, type, and how a picture is handed back."""
+"""The one look of all pictures: colors, type, and how a picture is handed back."""
 
 import io
 import os
@@ -16,7 +16,7 @@ Picture = UInt8[np.ndarray, "height width 3"]
 INK, PAPER, GRID = "#3b3733", "#ffffff", "#e6e2dc"
 #: Behind bodies.
 BACKGROUND = (246, 244, 240)
-#: Of curves in turn: Okabe and Ito's, told apart by all kinds of colour vision.
+#: Of curves in turn: Okabe and Ito's, told apart by all kinds of color vision.
 CURVES = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", INK)
 #: Pixels between panels.
 GAP = 6
@@ -44,16 +44,16 @@ class _Shown(np.ndarray):
         }
 
 
-def hex_colour(rgb: tuple[int, int, int]) -> str:
+def hex_color(rgb: tuple[int, int, int]) -> str:
     """As matplotlib takes it."""
     return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
-#: Colours of clear, penetrating and inverted vertices, by label.
+#: Colors of clear, penetrating and inverted vertices, by label.
 LABEL_COLORS = {
-    0: hex_colour(BODY_COLOR),
-    1: hex_colour(PENETRATING_COLOR),
-    -1: hex_colour(INVERTED_COLOR),
+    0: hex_color(BODY_COLOR),
+    1: hex_color(PENETRATING_COLOR),
+    -1: hex_color(INVERTED_COLOR),
 }
 
 

@@ -173,7 +173,7 @@ def _as_bodies(vertices: Any, faces: Any) -> list[tuple[np.ndarray, np.ndarray]]
 def _draw_bodies(
     bodies: list[tuple[np.ndarray, np.ndarray]], camera: PinholeCamera, width: int, height: int
 ) -> Float[np.ndarray, "height width 4"]:
-    """Colour and opacity of the bodies alone."""
+    """Color and opacity of the bodies alone."""
     pyvista = import_extra("pyvista")
     if not bodies:
         return np.zeros((height, width, 4))
@@ -208,7 +208,7 @@ def _draw_bodies(
 def _aim(
     plotter: Any, camera: PinholeCamera, width: int, height: int, depth: Float[np.ndarray, "V"]
 ) -> None:
-    # The camera's own matrix, in place of an angle of view and a window centre: those take one
+    # The camera's own matrix, in place of an angle of view and a window center: those take one
     # focal length for both axes.
     vtk = import_extra("vtkmodules.vtkCommonMath").vtkCommonMath
     far = max(1.1 * float(depth.max()), 2e-3)

@@ -53,14 +53,14 @@ def draw_panel(
     marked = marked_triangles(labels, faces)
     out = (labels[faces] > 0).any(axis=1)
     kind = marked * np.where(out, 1, 2)
-    colours = np.array([BODY_COLOR, PENETRATING_COLOR, INVERTED_COLOR], np.uint8)[kind]
+    colors = np.array([BODY_COLOR, PENETRATING_COLOR, INVERTED_COLOR], np.uint8)[kind]
     normals = vertex_normals(vertices, faces)
-    body = _add_surface(plotter, vertices, faces, normals, colours)
+    body = _add_surface(plotter, vertices, faces, normals, colors)
     plotter.render()  # screenshot alone would return what was drawn last
     picture = plotter.screenshot(return_img=True).astype(np.float64)
     if marked.any():
         plotter.remove_actor(body, reset_camera=False, render=False)
-        _add_surface(plotter, vertices, faces[marked], normals, colours[marked], outline=True)
+        _add_surface(plotter, vertices, faces[marked], normals, colors[marked], outline=True)
         plotter.render()
         spots = plotter.screenshot(return_img=True, transparent_background=True)
         opacity = _SEEN_THROUGH * (spots[..., 3:] / 255)
@@ -75,18 +75,18 @@ def _add_surface(
     vertices: np.ndarray,
     faces: np.ndarray,
     normals: np.ndarray,
-    colours: np.ndarray,
+    colors: np.ndarray,
     outline: bool = False,
 ) -> Any:
     mesh = import_extra("pyvista").PolyData.from_regular_faces(vertices, faces)
     mesh.point_data.active_normals = normals
-    mesh.cell_data["colour"] = colours
+    mesh.cell_data["color"] = colors
     # render=False: a first drawing before the interpolation is set leaves the normals out for good.
-    options = {"scalars": "colour", "rgb": True, "reset_camera": False, "render": False}
+    options = {"scalars": "color", "rgb": True, "reset_camera": False, "render": False}
     actor = plotter.add_mesh(mesh, **options, **MATERIAL)
     actor.prop.interpolation = "Phong"
     if outline:
-        # Edges in the triangle's own colour widen a spot by a pixel: slivers survive scaling.
+        # Edges in the triangle's own color widen a spot by a pixel: slivers survive scaling.
         edges = {"style": "wireframe", "line_width": 1.5 * OVERSAMPLING, "lighting": False}
         plotter.add_mesh(mesh, **options, **edges)
     return actor

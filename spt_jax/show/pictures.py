@@ -31,9 +31,9 @@ def render_mesh(
 ) -> Picture:
     """Return a picture of one mesh, with its labelled triangles seen through the rest.
 
-    A triangle is coloured if all of its vertices are labelled, or if one is that would otherwise
+    A triangle is colored if all of its vertices are labelled, or if one is that would otherwise
     not show: penetrating (+1) vermillion, otherwise inverted (-1) blue. Overlapping parts hide each
-    other, so coloured triangles are drawn a second time over the finished picture: what lies inside
+    other, so colored triangles are drawn a second time over the finished picture: what lies inside
     the body shows as a fainter spot.
 
     Args:

@@ -20,7 +20,7 @@ from spt_jax.show.look import (
     drawn,
     dress,
     finished,
-    hex_colour,
+    hex_color,
 )
 from spt_jax.show.rays import BeamCast, RayProfile, cast_beam, profile, ray_images
 
@@ -77,7 +77,7 @@ def plot_rays(
     from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
 
     most = max(int(images.crossings.max()), 2)
-    # Closed meshes are crossed an even number of times: one colour for each.
+    # Closed meshes are crossed an even number of times: one color for each.
     edges = np.arange(1, most + 2, 2)
     shades = LinearSegmentedColormap.from_list("counts", _COUNTS)(np.linspace(0, 1, len(edges) - 1))
     counts = np.ma.masked_equal(images.crossings, 0)
@@ -92,11 +92,11 @@ def plot_rays(
     )
     lengths = np.ma.masked_less_equal(images.overlap, 0)
     deepest = float(images.overlap.max()) or 1.0
-    colours = LinearSegmentedColormap.from_list("lengths", _LENGTHS)
-    shown = right.imshow(lengths, cmap=colours, vmin=0, vmax=deepest, **_STILL)
+    colors = LinearSegmentedColormap.from_list("lengths", _LENGTHS)
+    shown = right.imshow(lengths, cmap=colors, vmin=0, vmax=deepest, **_STILL)
     _label(figure.colorbar(shown, ax=right, **_BAR), _with_unit("length in overlap", unit))
     for axes in (left, right):
-        axes.set_facecolor(hex_colour(BACKGROUND))
+        axes.set_facecolor(hex_color(BACKGROUND))
         axes.set(xticks=[], yticks=[])
         axes.set_adjustable("datalim")  # the background fills the panel
         axes.spines[:].set_visible(False)
@@ -122,7 +122,7 @@ def plot_ray(
     Of the rays that lie in overlaps for at least half as long as any, or, where nothing overlaps,
     of those that cross most triangles, it is the one whose crossings are farthest apart. The
     counter rises where the ray enters the surface and falls where it leaves it: it is the winding
-    number. Crossings are coloured by their label.
+    number. Crossings are colored by their label.
 
     Args:
         vertices: positions, in any unit.
@@ -197,11 +197,11 @@ def _draw_cut(axes: Any, found: BeamCast, ray: int, along: RayProfile, aspect: f
     np.add.at(steps, (columns[chosen], place), found.crossings.sign[chosen])
     winding = np.cumsum(steps, axis=1)[:, :-1]
     pixel = found.beam.pixel[0]
-    colours = [LABEL_COLORS[-1], hex_colour(BACKGROUND), LABEL_COLORS[0], LABEL_COLORS[1], _TRIPLE]
+    colors = [LABEL_COLORS[-1], hex_color(BACKGROUND), LABEL_COLORS[0], LABEL_COLORS[1], _TRIPLE]
     axes.imshow(
         winding,
-        cmap=ListedColormap(colours),
-        norm=BoundaryNorm([-99, -0.5, 0.5, 1.5, 2.5, 99], len(colours)),
+        cmap=ListedColormap(colors),
+        norm=BoundaryNorm([-99, -0.5, 0.5, 1.5, 2.5, 99], len(colors)),
         extent=(low, high, (len(winding) - column - 0.5) * pixel, (-column - 0.5) * pixel),
         interpolation="nearest",
         aspect="auto",
@@ -210,7 +210,7 @@ def _draw_cut(axes: Any, found: BeamCast, ray: int, along: RayProfile, aspect: f
     axes.set(xlim=(low, high), ylim=(-half, half), yticks=[])
     axes.spines[:].set_visible(False)
     axes.tick_params(bottom=False, labelbottom=False)
-    axes.set_facecolor(hex_colour(BACKGROUND))
+    axes.set_facecolor(hex_color(BACKGROUND))
     axes.axhline(0.0, color=INK, linewidth=1.6)
     axes.annotate(
         "", (high, 0), (high - pad / 2, 0), arrowprops={"arrowstyle": "-|>", "color": INK}
@@ -227,7 +227,7 @@ def _draw_cut(axes: Any, found: BeamCast, ray: int, along: RayProfile, aspect: f
     seen = {int(w) for w in np.unique(np.clip(winding, -1, 3))}
     levels[3] = ("more than twice", 4)
     handles = [
-        Patch(facecolor=colours[entry[1]], label=entry[0])
+        Patch(facecolor=colors[entry[1]], label=entry[0])
         for level, entry in levels.items()
         if entry is not None and level in seen
     ]

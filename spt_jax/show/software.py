@@ -126,7 +126,7 @@ class SoftwarePlotter:
         lighting: bool = True,
         **options: Any,
     ) -> _Actor:
-        """A `pyvista.PolyData` of one color, or with the array "colour" of its triangles."""
+        """A `pyvista.PolyData` of one color, or with the array "color" of its triangles."""
         material = {k: v for k, v in options.items() if not isinstance(v, bool)}
         lines = line_width if style == "wireframe" else None
         self._actors.append(_Actor(mesh, color, scalars is not None, lines, lighting, material))
@@ -163,7 +163,7 @@ class SoftwarePlotter:
         faces_kept = np.flatnonzero(seen[faces, 3].all(axis=1))
         faces = faces[faces_kept]
         if actor.has_colors:
-            colors = np.asarray(mesh.cell_data["colour"], float)[faces_kept] / 255
+            colors = np.asarray(mesh.cell_data["color"], float)[faces_kept] / 255
         else:
             colors = np.tile(_rgb(actor.color), (len(faces), 1))
         corners = seen[faces, :3]

@@ -16,7 +16,7 @@ from spt_jax.show.look import GAP, MATERIAL, Picture, check_png, check_size, fin
 from spt_jax.show.offscreen import import_extra
 from spt_jax.show.panel import draw_panel, panel_plotter
 
-# By part in turn: neighbours differ, and none is near the red of collisions.
+# By part in turn: neighbors differ, and none is near the red of collisions.
 _COLOURS = np.array(
     [(86, 140, 178), (226, 178, 92), (110, 168, 130), (150, 134, 190), (196, 190, 176)], np.uint8
 )
@@ -36,7 +36,7 @@ def render_spheres(
 ) -> Picture:
     """Return a picture of a body, and beside it of its spheres under its translucent skin.
 
-    Spheres are coloured by part, and red where they collide; a hidden collision shines through.
+    Spheres are colored by part, and red where they collide; a hidden collision shines through.
 
     Args:
         body: what the spheres were fitted to.
@@ -79,7 +79,7 @@ def render_spheres(
     )
     # By the part's place in the order of parts, so that parent and child differ mostly.
     _, place = np.unique(spheres.part, return_inverse=True)
-    colours = np.where(
+    colors = np.where(
         colliding[:, None], np.array(PENETRATING_COLOR, np.uint8), _COLOURS[place % len(_COLOURS)]
     )
     owner = np.repeat(np.arange(len(radii)), len(ball.faces))
@@ -92,7 +92,7 @@ def render_spheres(
         plotter.clear_actors()
         scene = import_extra("pyvista").PolyData.from_regular_faces(points, triangles)
         scene.point_data.active_normals = normals
-        scene.cell_data["colour"] = colours[owner]
+        scene.cell_data["color"] = colors[owner]
         drawn = _draw(plotter, scene, size)[..., :3]
         picture = drawn + _GHOST * (shown - drawn)
         if colliding.any():
@@ -113,13 +113,13 @@ def _only(
 ) -> Any:
     part = import_extra("pyvista").PolyData.from_regular_faces(points, triangles[kept])
     part.point_data.active_normals = normals
-    part.cell_data["colour"] = np.asarray(scene.cell_data["colour"])[kept]
+    part.cell_data["color"] = np.asarray(scene.cell_data["color"])[kept]
     return part
 
 
 def _draw(plotter: Any, scene: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 4"]:
     # render=False: a first drawing before the interpolation is set leaves the normals out for good.
-    options = {"scalars": "colour", "rgb": True, "reset_camera": False, "render": False}
+    options = {"scalars": "color", "rgb": True, "reset_camera": False, "render": False}
     plotter.add_mesh(scene, **options, **MATERIAL).prop.interpolation = "Phong"
     plotter.render()
     solid: UInt8[np.ndarray, "H W 3"] = plotter.screenshot(return_img=True)

@@ -10,7 +10,7 @@ from spt_jax.keypoints.layout import Layout, edge_side, side
 from spt_jax.keypoints.layouts import as_layout
 from spt_jax.show.look import CURVES, INK, PAPER, blank_figure, drawn
 
-# Okabe and Ito's blue and orange are told apart by all kinds of colour vision.
+# Okabe and Ito's blue and orange are told apart by all kinds of color vision.
 _SIDES = {"left": CURVES[1], "right": CURVES[4], "middle": INK}
 _FAINTEST = 0.45  # of a point of confidence 0.01; one of 1 is opaque
 
@@ -110,7 +110,7 @@ def _draw(axes: Any, person: StickFigure, radius: float) -> None:
     points, trust, fitted, layout = person
     unit = radius * 72 / axes.figure.dpi  # matplotlib counts widths in points of type
     seen = trust > 0
-    colours = [_SIDES[side(name)] for name in layout.names] if layout else [INK] * len(points)
+    colors = [_SIDES[side(name)] for name in layout.names] if layout else [INK] * len(points)
     strength = _FAINTEST + (1 - _FAINTEST) * trust
     # For each line its two keypoints and its side.
     lines = [(*edge, edge_side(layout, edge)) for edge in layout.edges] if layout else []
@@ -121,9 +121,7 @@ def _draw(axes: Any, person: StickFigure, radius: float) -> None:
             axes.plot(x, y, color=PAPER, linewidth=1.3 * unit, **line)
             axes.plot(x, y, color=_SIDES[where], linewidth=0.75 * unit, **line)
     for k in np.flatnonzero(seen):
-        _circle(
-            axes, points[k], radius, 0.35 * unit, PAPER, facecolor=colours[k], alpha=strength[k]
-        )
+        _circle(axes, points[k], radius, 0.35 * unit, PAPER, facecolor=colors[k], alpha=strength[k])
     if fitted is None:
         return
     for k in np.flatnonzero(np.isfinite(fitted).all(axis=1)):

@@ -23,8 +23,8 @@ class Surface:
     Attributes:
         faces: without those that list a vertex twice; they have no area.
         num_vertices: of the mesh.
-        neighbours: (V, V) sparse matrix of ones where two vertices share an edge.
-        laplacian: (V, V), the graph's: degree minus neighbours.
+        neighbors: (V, V) sparse matrix of ones where two vertices share an edge.
+        laplacian: (V, V), the graph's: degree minus neighbors.
     """
 
     def __init__(self, faces: Int[np.ndarray, "F 3"], num_vertices: int):
@@ -38,13 +38,13 @@ class Surface:
             (num_vertices, num_vertices),
         ).tocsr()
         links.data[:] = 1.0
-        self.neighbours: Any = links
+        self.neighbors: Any = links
         self.laplacian: Any = scipy.sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
 
     @cached_property
     def part(self) -> Int[np.ndarray, "V"]:
         """The connected part of each vertex, numbered from 0."""
-        return scipy.sparse.csgraph.connected_components(self.neighbours, directed=False)[1]
+        return scipy.sparse.csgraph.connected_components(self.neighbors, directed=False)[1]
 
     @cached_property
     def num_parts(self) -> int:
@@ -90,7 +90,7 @@ class Surface:
         reached[start] = True
         front = start
         for _ in range(most):
-            near = np.unique(self.neighbours[front].indices)
+            near = np.unique(self.neighbors[front].indices)
             front = near[~reached[near]]
             if not len(front):
                 break
@@ -106,7 +106,7 @@ class Surface:
             return []
         place = np.full(self.num_vertices, -1)
         place[members] = np.arange(len(members))
-        edges = self.neighbours[members][:, members].tocoo()
+        edges = self.neighbors[members][:, members].tocoo()
         label = connected(
             np.concatenate([edges.row, place[first]]),
             np.concatenate([edges.col, place[second]]),
@@ -118,7 +118,7 @@ class Surface:
 
     def edge_length(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
         """The mean length of the edges at each vertex; zero where there are none."""
-        graph = self.neighbours
+        graph = self.neighbors
         row = np.repeat(np.arange(self.num_vertices), np.diff(graph.indptr))
         length = np.linalg.norm(vertices[row] - vertices[graph.indices], axis=1)
         total = np.bincount(row, length, self.num_vertices)

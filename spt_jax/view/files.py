@@ -194,7 +194,7 @@ def mocap_for(body: AbstractBody) -> dict[str, Frames]:
 
 
 def mesh_bytes(scene: Scene, reading: Reading) -> bytes:
-    """The surface as a .glb, coloured by label."""
+    """The surface as a .glb, colored by label."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.glb"
         write_mesh(path, reading.vertices, scene.faces, reading.labels)

@@ -243,6 +243,6 @@ def volume_text(volume: float, scene: Scene) -> str:
     return f"{volume * _CUBIC_CENTIMETRES:.2f} cm³"
 
 
-def _dot(colour: tuple[int, int, int]) -> str:
+def _dot(color: tuple[int, int, int]) -> str:
     style = "display:inline-block;width:0.75em;height:0.75em;border-radius:50%"
-    return f'<span style="{style};background:rgb{colour}"></span>'
+    return f'<span style="{style};background:rgb{color}"></span>'

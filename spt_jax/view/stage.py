@@ -1,4 +1,4 @@
-"""The 3D side of the live view: the surface in the colours of its labels, and the handles."""
+"""The 3D side of the live view: the surface in the colors of its labels, and the handles."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,7 +22,7 @@ _FIELD_OF_VIEW = 0.5  # radians, of the height
 _CLEAR, _PENETRATING, _INVERTED = (
     f"/surface/{label}" for label in ("clear", "penetrating", "inverted")
 )
-# Drawn first, in no colour at all, it hides all but the surface's front layer: transparent
+# Drawn first, in no color at all, it hides all but the surface's front layer: transparent
 # triangles are not sorted, and those behind would show through in patches.
 _VEIL = "/surface/veil"
 
@@ -76,12 +76,12 @@ class Stage:
         marked = marked_triangles(reading.labels, faces)
         penetrating = marked & (reading.labels[faces] == PENETRATING).any(axis=1)
         with self._server.atomic():
-            for chosen, colour, names in (
+            for chosen, color, names in (
                 (~marked, BODY_COLOR, (_VEIL, _CLEAR)),
                 (penetrating, PENETRATING_COLOR, (_PENETRATING,)),
                 (marked & ~penetrating, INVERTED_COLOR, (_INVERTED,)),
             ):
-                self._draw(reading.vertices, faces[chosen], colour, names)
+                self._draw(reading.vertices, faces[chosen], color, names)
             self.set_see_through(self.see_through)
 
     def set_see_through(self, wanted: bool) -> None:
@@ -129,7 +129,7 @@ class Stage:
         self,
         vertices: Float[np.ndarray, "V 3"],
         faces: Int[np.ndarray, "F 3"],
-        colour: tuple[int, int, int],
+        color: tuple[int, int, int],
         names: Sequence[str],
     ) -> None:
         # Only what the triangles use is sent: a few hundred vertices for a spot.
@@ -146,7 +146,7 @@ class Stage:
                     name,
                     points,
                     triangles,
-                    color=colour,
+                    color=color,
                     opacity=0.0 if name == _VEIL else None,
                     visible=any_face,
                     cast_shadow=False,

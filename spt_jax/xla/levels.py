@@ -131,7 +131,7 @@ def _barycentric(
     total = weights.sum(axis=0)
     weights = weights / jnp.where(total != 0, total, jnp.ones_like(total))[None, :]
     weights = jnp.clip(weights, 0.0, 1.0)
-    # A triangle with no area on the screen was crossed by rounding alone: take its centre.
+    # A triangle with no area on the screen was crossed by rounding alone: take its center.
     whole = weights.sum(axis=0)
     weights = weights / jnp.where(whole > 0, whole, jnp.ones_like(whole))[None, :]
     third = jnp.full_like(weights, 1.0 / 3.0)

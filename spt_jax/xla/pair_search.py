@@ -1,6 +1,6 @@
 """All pairs of triangles that pass through each other, of arrays whose sizes are known.
 
-Triangles are put in the order of a Morton curve through their centres, and every 16 of them make a
+Triangles are put in the order of a Morton curve through their centers, and every 16 of them make a
 cluster with a box. Clusters are tested against all clusters, 128 of them at once; pairs of clusters
 and then pairs of triangles whose boxes meet are taken up a fixed number at a time for as long as
 there are any, so that nothing can overflow. The cost grows with the square of the triangles / 256:
@@ -90,11 +90,11 @@ def _in_order(vertices, faces) -> tuple[Int[Array, "C 16"], Boxes]:
     """The triangles of each cluster, and their boxes; what fills the last one up is empty."""
     corner = vertices[faces]
     low, high = corner.min(axis=1), corner.max(axis=1)
-    centre = (low + high) / 2
-    lowest = centre.min(axis=0)[None]
-    extent = (centre - lowest).max()
+    center = (low + high) / 2
+    lowest = center.min(axis=0)[None]
+    extent = (center - lowest).max()
     step = (2**_BITS - 1) / jnp.where(extent > 0, extent, jnp.ones_like(extent))
-    code = ((centre - lowest) * step).astype(jnp.int32)
+    code = ((center - lowest) * step).astype(jnp.int32)
     key = jnp.zeros(len(faces), jnp.int32)
     for bit in range(_BITS):
         for axis in range(3):

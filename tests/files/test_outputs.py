@@ -35,7 +35,7 @@ def labelled_cube():
 COLOURS = {0: BODY_COLOR, 1: PENETRATING_COLOR, -1: INVERTED_COLOR}
 
 
-def test_ply_opens_elsewhere_with_the_same_colours(tmp_path):
+def test_ply_opens_elsewhere_with_the_same_colors(tmp_path):
     vertices, faces, labels = labelled_cube()
     write_mesh(tmp_path / "a.ply", vertices, faces, labels)
     mesh = trimesh.load_mesh(tmp_path / "a.ply", process=False)
@@ -46,7 +46,7 @@ def test_ply_opens_elsewhere_with_the_same_colours(tmp_path):
     np.testing.assert_array_equal(mesh.visual.vertex_colors, expected)
 
 
-def test_glb_opens_elsewhere_with_linear_colours_and_a_material_that_is_no_metal(tmp_path):
+def test_glb_opens_elsewhere_with_linear_colors_and_a_material_that_is_no_metal(tmp_path):
     vertices, faces, labels = labelled_cube()
     write_mesh(tmp_path / "a.glb", vertices, faces, labels)
     (mesh,) = trimesh.load_scene(tmp_path / "a.glb", process=False).geometry.values()

@@ -385,16 +385,16 @@ def test_the_laplacian_term_is_mean_squared_change_in_square_millimetres():
     body = embedded_body()
     start, now = people("walk/0010"), people("run/0010")
     term = Laplacian().prepared(body, 1)
-    neighbours = [set() for _ in range(body.num_vertices)]
+    neighbors = [set() for _ in range(body.num_vertices)]
     for a, b, c in np.asarray(body.faces).tolist():
-        neighbours[a] |= {b, c}
-        neighbours[b] |= {a, c}
-        neighbours[c] |= {a, b}
+        neighbors[a] |= {b, c}
+        neighbors[b] |= {a, c}
+        neighbors[c] |= {a, b}
     coordinates = []
     for which in (start, now):
         vertices = body(which.pose.at[:, 0].set(0.0), which.shape).vertices[0]
         vertices = np.asarray(vertices, np.float64)
-        means = np.array([vertices[list(row)].mean(axis=0) for row in neighbours])
+        means = np.array([vertices[list(row)].mean(axis=0) for row in neighbors])
         coordinates.append(vertices - means)
     change = 1e6 * np.mean(np.sum((coordinates[1] - coordinates[0]) ** 2, axis=1))
     assert change > 0.01

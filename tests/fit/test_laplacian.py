@@ -88,7 +88,7 @@ def test_numbering_of_vertices_does_not_matter(laplacian, rng, dtype):
     )
 
 
-def test_a_vertex_without_neighbours_costs_nothing(dtype):
+def test_a_vertex_without_neighbors_costs_nothing(dtype):
     laplacian = MeshLaplacian.from_faces(FACES, COUNT + 2)
     start = jnp.asarray(np.concatenate([VERTICES, np.ones((2, 3))]), dtype)
     end = start.at[COUNT:].add(5.0)

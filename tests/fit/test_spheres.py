@@ -95,7 +95,7 @@ def test_derivative_of_two_spheres_in_closed_form(x64):
     np.testing.assert_allclose(slope, expected, rtol=1e-12)
 
 
-def test_spheres_that_share_their_centre_have_a_finite_derivative(dtype):
+def test_spheres_that_share_their_center_have_a_finite_derivative(dtype):
     body, spheres = arm()
     there = jnp.asarray([[0.0, 0, 0], [0.0, 0, 0]], dtype)
     same = BodySpheres(
@@ -167,11 +167,11 @@ def test_the_embedded_body_is_filled(spheres):
     assert len(BodySpheres.fit(body, share=0.5).part) < 0.8 * len(spheres.part)
 
 
-def test_neighbours_and_folds_do_not_count(spheres):
+def test_neighbors_and_folds_do_not_count(spheres):
     body = embedded_body()
     part = np.array(spheres.part)
     pairs = {tuple(sorted(pair)) for pair in part[spheres.pairs].tolist()}
-    assert not pairs & set(body.neighbour_pairs)
+    assert not pairs & set(body.neighbor_pairs)
     names = [body.joint_names.index(n) for n in ("left_hip", "spine1", "left_wrist", "right_knee")]
     thigh, belly, hand, shin = names
     assert {tuple(sorted(p)) for p in ((belly, hand), (thigh, shin), (hand, shin))} <= pairs
@@ -223,7 +223,7 @@ def test_rigid_motion_moves_the_spheres_and_changes_no_penalty(spheres, rng, dty
 
 
 def test_spheres_are_carried_as_the_slow_body_carries_its_skin(x64, rng):
-    """A sphere's centre moves as a vertex there that follows its joint alone."""
+    """A sphere's center moves as a vertex there that follows its joint alone."""
     body = embedded_body()
     spheres = BodySpheres.fit(body)
     pose, shape = 0.4 * rng.normal(size=(52, 3)), rng.normal(size=10)

@@ -273,9 +273,9 @@ def test_off_as_people_have_it(tmp_path):
     file = tmp_path / "a.off"
     write_off(file, vertices, polygons)
     plain = file.read_text()
-    coloured = plain.replace("OFF\n20 12 0\n", "# made by hand\n\n OFF 20 12 0\n") + " 255 0 0"
+    colored = plain.replace("OFF\n20 12 0\n", "# made by hand\n\n OFF 20 12 0\n") + " 255 0 0"
     broken = plain.replace("\n4 ", "\n4\n ")
-    for content in (coloured, broken, plain.replace("OFF\n", "OFF")):
+    for content in (colored, broken, plain.replace("OFF\n", "OFF")):
         file.write_text(content)
         found, faces = read_mesh(file)
         assert signed_volume(found, faces) == pytest.approx(volume)
@@ -443,7 +443,7 @@ def test_lines_of_a_ply_that_say_more_than_the_header(tmp_path):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_lists_of_differing_lengths_between_other_properties(tmp_path, order):
-    """Polygons of a binary .ply with a number before the list and a colour behind it."""
+    """Polygons of a binary .ply with a number before the list and a color behind it."""
     vertices, polygons, volume = star_prism()
     form = "little" if order == "<" else "big"
     header = f"ply\nformat binary_{form}_endian 1.0\nelement vertex {len(vertices)}\n"

@@ -43,7 +43,7 @@ def write_obj(folder):
 def test_obj_keeps_all_but_positions_and_brings_its_materials(tmp_path):
     file = write_obj(tmp_path)
     opened = open_mesh(file)
-    assert opened.raw.extras == ("vertex colours", "texture coordinates", "materials")
+    assert opened.raw.extras == ("vertex colors", "texture coordinates", "materials")
     assert check_mesh(opened.vertices, opened.faces).ok
     out = tmp_path / "out"
     out.mkdir()
@@ -64,7 +64,7 @@ def test_obj_keeps_all_but_positions_and_brings_its_materials(tmp_path):
     (note,) = opened.write(out / "b.obj", moved)
     assert note == "b.obj names files that were not found: red.png"
     (note,) = opened.write(out / "b.ply", moved)
-    assert note == "left out in b.ply: vertex colours, texture coordinates, materials"
+    assert note == "left out in b.ply: vertex colors, texture coordinates, materials"
 
 
 def test_names_in_a_mesh_reach_nothing_outside_of_its_folder(tmp_path):
@@ -81,7 +81,7 @@ def test_names_in_a_mesh_reach_nothing_outside_of_its_folder(tmp_path):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_ply_keeps_colours_and_texture_coordinates(tmp_path, form, dtype):
+def test_ply_keeps_colors_and_texture_coordinates(tmp_path, form, dtype):
     vertices, faces = box()
     names = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("s", "f4"), ("red", "u1"), ("green", "u1")]
     rows = np.zeros(8, [*names, ("blue", "u1")])
@@ -108,7 +108,7 @@ def test_ply_keeps_colours_and_texture_coordinates(tmp_path, form, dtype):
     again = open_mesh(tmp_path / "b.ply")
     np.testing.assert_array_equal(again.vertices, moved)
     np.testing.assert_array_equal(again.faces, faces)
-    assert again.raw.extras == ("texture coordinates", "colours")
+    assert again.raw.extras == ("texture coordinates", "colors")
     mesh = trimesh.load_mesh(tmp_path / "b.ply", process=False)
     raw = mesh.metadata["_ply_raw"]
     np.testing.assert_array_equal(raw["vertex"]["data"]["red"], np.arange(8))
@@ -117,7 +117,7 @@ def test_ply_keeps_colours_and_texture_coordinates(tmp_path, form, dtype):
     assert b"comment kept" in (tmp_path / "b.ply").read_bytes()
 
 
-def test_off_keeps_colours_of_vertices_and_faces(tmp_path):
+def test_off_keeps_colors_of_vertices_and_faces(tmp_path):
     vertices, faces = box()
     lines = ["COFF", "8 12 0"] + [f"{x} {y} {z} 9 8 7 6" for x, y, z in vertices.tolist()]
     lines += [f"3 {a} {b} {c} {k} 0 0" for k, (a, b, c) in enumerate(faces.tolist())]
@@ -171,4 +171,4 @@ def test_stl_says_what_it_loses(tmp_path):
     (tmp_path / "a.stl").write_bytes(content)
     opened = open_mesh(tmp_path / "a.stl")
     notes = opened.write(tmp_path / "b.stl", opened.vertices.astype(np.float32))
-    assert notes == ("left out in b.stl: attributes or colours of triangles",)
+    assert notes == ("left out in b.stl: attributes or colors of triangles",)

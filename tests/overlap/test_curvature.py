@@ -111,7 +111,7 @@ def test_laws_of_motion_and_scale(name):
 def test_folds_and_groups_of_bodies(frame, rng):
     body = embedded_body()
     (vertices,), faces = posed_bodies([frame]), np.asarray(body.faces, np.int64)
-    groups = as_exclusions(body.part_groups, body.neighbour_pairs, None, faces)
+    groups = as_exclusions(body.part_groups, body.neighbor_pairs, None, faces)
     velocity = np.sin(vertices @ rng.standard_normal((3, 3)) * 8)
     for exclusions in (body_exclusions(), groups):
         found = measured(vertices, faces, exclusions)

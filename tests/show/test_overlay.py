@@ -20,7 +20,7 @@ BLUE, ORANGE = (0, 114, 178), (230, 159, 0)
 
 @pytest.fixture
 def camera(rng):
-    """Off centre, with two focal lengths, turned and moved."""
+    """Off center, with two focal lengths, turned and moved."""
     rotation = Rotation.from_rotvec([2.8, 0.4, -0.3]).as_matrix()
     return PinholeCamera((170.0, 140.0), (61.0, 77.0), rotation, (0.1, 0.3, 3.0))
 
@@ -41,8 +41,8 @@ def middle(picture):
     return np.array([x.mean(), y.mean()]) + 0.5
 
 
-def near(picture, colour):
-    return np.abs(picture.astype(int) - colour).max(axis=2) < 30
+def near(picture, color):
+    return np.abs(picture.astype(int) - color).max(axis=2) < 30
 
 
 @needs_drawing
@@ -82,7 +82,7 @@ def test_what_is_near_hides_what_is_far_in_a_picture_of_several(camera):
     both = render_overlay(SIZE, [far, close], faces, camera)
     swapped = render_overlay(SIZE, [close, far], faces, camera)
     x, y = np.round(np.asarray(camera.center)).astype(int)
-    assert np.abs(both[y, x].astype(int) - swapped[y, x]).max() > 15  # the near one's own colour
+    assert np.abs(both[y, x].astype(int) - swapped[y, x]).max() > 15  # the near one's own color
     first, second = (render_overlay(SIZE, points, faces, camera) for points in (far, close))
     np.testing.assert_array_equal(ink(both) > 5, (ink(first) > 5) | (ink(second) > 5))
     stacked = render_overlay(SIZE, np.stack([far, close]), faces, camera)
@@ -117,7 +117,7 @@ def test_a_body_behind_the_camera_or_around_it_is_not_drawn_over_the_picture():
 
 
 @needs_drawing
-def test_keypoints_are_dots_in_their_sides_colours_and_missing_ones_are_left_out():
+def test_keypoints_are_dots_in_their_sides_colors_and_missing_ones_are_left_out():
     camera = PinholeCamera(100.0, (80.0, 60.0))
     faces = np.array([[0, 1, 2]])
     layout = LAYOUTS["coco17"]
@@ -127,8 +127,8 @@ def test_keypoints_are_dots_in_their_sides_colours_and_missing_ones_are_left_out
         points[layout.names.index(name)] = place
         confidence[layout.names.index(name)] = 1
     picture = render_overlay(SIZE, [], faces, camera, points, confidence, skeleton="coco17")
-    for colour, place in ((BLUE, (40, 30)), (ORANGE, (120, 90))):
-        y, x = np.nonzero(near(picture, colour))
+    for color, place in ((BLUE, (40, 30)), (ORANGE, (120, 90))):
+        y, x = np.nonzero(near(picture, color))
         assert len(x) >= 4
         np.testing.assert_allclose([x.mean() + 0.5, y.mean() + 0.5], place, atol=0.3)
     # Nothing else is drawn: no line to what is missing, nothing at (0, 0).
@@ -184,8 +184,8 @@ def test_photographs_are_turned_as_their_camera_says(tmp_path):
     exif[0x0112] = 6  # the top is at the right
     image.save(tmp_path / "a.jpg", exif=exif)
     assert read_image(tmp_path / "a.jpg").shape == (40, 20, 3)
-    Image.new("L", (20, 30)).save(tmp_path / "grey.png")
-    assert read_image(tmp_path / "grey.png").shape == (30, 20, 3)
+    Image.new("L", (20, 30)).save(tmp_path / "gray.png")
+    assert read_image(tmp_path / "gray.png").shape == (30, 20, 3)
 
 
 @pytest.mark.parametrize(

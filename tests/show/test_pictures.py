@@ -35,7 +35,7 @@ def labels_where(mask):
 
 
 @needs_drawing
-def test_a_mesh_is_drawn_and_only_labels_are_coloured(ball, tmp_path):
+def test_a_mesh_is_drawn_and_only_labels_are_colored(ball, tmp_path):
     vertices, faces = ball
     plain = render_mesh(vertices, faces, size=SIZE, path=tmp_path / "a.png")
     assert plain.shape == (128, 96, 3) and plain.dtype == np.uint8

@@ -26,15 +26,15 @@ def bundle_of(picture):
 
 @pytest.fixture(scope="module")
 def balls():
-    """Two unit balls whose centres are 1.2 apart along x and z, above one another along neither."""
+    """Two unit balls whose centers are 1.2 apart along x and z, above one another along neither."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     moved = ball.copy().apply_translation([0.9, 0.2, 0.7])
     both = one_mesh(ball, moved)
     return np.array(both.vertices), np.array(both.faces)
 
 
-def near(picture, colour, tolerance=12):
-    channels = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+def near(picture, color, tolerance=12):
+    channels = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
     return (np.abs(picture.astype(int) - channels).max(axis=2) <= tolerance).sum()
 
 
@@ -49,7 +49,7 @@ def test_the_lengths_add_up_to_the_volume_from_every_side(balls, view):
     assert (images.crossings[images.overlap > 0] >= 4).all()
     crossed = (images.crossings > 0).sum() * images.ray_area
     hull = trimesh.Trimesh(*balls)
-    if view == "front":  # from z, the union of two discs of radius 1, centres 0.92 apart
+    if view == "front":  # from z, the union of two discs of radius 1, centers 0.92 apart
         distance = np.hypot(0.9, 0.2)
         lens = 2 * np.arccos(distance / 2) - distance / 2 * np.sqrt(4 - distance**2)
         assert crossed == pytest.approx(2 * np.pi - lens, rel=0.02)
@@ -135,7 +135,7 @@ def test_arrows_point_where_they_are_told_to(balls):
     plain = render_arrows(ball, triangles, 0 * ball, size=(120, 120), view=(0.0, 0.0))
     top = np.argmax(ball[:, 2])  # at the middle of the picture
 
-    def centre(vector):
+    def center(vector):
         vectors = np.zeros_like(ball)
         vectors[top] = vector
         picture = render_arrows(ball, triangles, vectors, size=(120, 120), view=(0.0, 0.0))
@@ -145,7 +145,7 @@ def test_arrows_point_where_they_are_told_to(balls):
 
     for vector in ([1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]):
         # About half of an arrow's length, a fifth of 120 pixels, and not off to a side.
-        x, y = centre(vector)
+        x, y = center(vector)
         assert np.dot((x, y), vector[:2]) == pytest.approx(12.5, abs=2)
         assert abs(np.cross([x, y, 0], vector)[2]) < 1
     with pytest.raises(ValueError, match="one for each vertex"):
@@ -177,11 +177,11 @@ def test_pictures_show_themselves_in_notebooks_and_only_as_pictures():
     assert type(picture / 2) is np.ndarray and isinstance((picture > 0).sum(), np.integer)
 
 
-def test_curves_past_the_colours_are_dashed():
+def test_curves_past_the_colors_are_dashed():
     flat = {str(i): np.full(40, float(i)) for i in range(len(look.CURVES) + 1)}
     every = plot_curves(flat, **_AXES)
-    for colour in look.CURVES:
-        assert near(every, colour) > 500  # a row at least of 600 pixels
+    for color in look.CURVES:
+        assert near(every, color) > 500  # a row at least of 600 pixels
     twice = near(every, look.CURVES[0])
     flat.popitem()
     once = near(plot_curves(flat, **_AXES), look.CURVES[0])

@@ -1,4 +1,4 @@
-"""Pictures of spheres: coloured by part, red where they collide."""
+"""Pictures of spheres: colored by part, red where they collide."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +21,8 @@ def test_the_picture_shows_the_body_its_spheres_and_collisions_in_red(tmp_path):
     assert rest.shape == (160, 326, 3) and rest.dtype == np.uint8
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "spheres.png")), rest)
     assert red(rest) == 0
-    colour = np.ptp(rest.astype(int), axis=2) > 45
-    assert colour[:, :160].sum() == 0 and colour[:, 166:].sum() > 500
+    color = np.ptp(rest.astype(int), axis=2) > 45
+    assert color[:, :160].sum() == 0 and color[:, 166:].sum() > 500
 
     pose = jnp.zeros((52, 3)).at[body.joint_names.index("left_shoulder"), 1].set(-1.2)
     pose = pose.at[body.joint_names.index("left_elbow"), 1].set(-2.5)

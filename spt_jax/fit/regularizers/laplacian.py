@@ -1,4 +1,4 @@
-"""Laplacian regularization, the paper's rival "RE + LR": vertices move as their neighbours do."""
+"""Laplacian regularization, the paper's rival "RE + LR": vertices move as their neighbors do."""
 
 import dataclasses
 from typing import ClassVar
@@ -20,12 +20,12 @@ from spt_jax.overlap.topology import Edges
 class MeshLaplacian(eqx.Module):
     """The uniform Laplacian of a mesh (Wang et al. 2018, section 3.3).
 
-    delta_p = p - mean of p's neighbours; zero for a vertex without any. Make one with `from_faces`,
+    delta_p = p - mean of p's neighbors; zero for a vertex without any. Make one with `from_faces`,
     once and outside `jit`; it is a pytree.
 
     Attributes:
         edges: both ends of every edge, each edge once.
-        valence: how many neighbours each vertex has.
+        valence: how many neighbors each vertex has.
 
     Example:
         >>> from spt_jax import load_body
@@ -78,7 +78,7 @@ class MeshLaplacian(eqx.Module):
         """
         self._check("vertices", vertices)
         # Scatters over the edges: with the gradient 1.4 ms for 12,272 vertices on two CPU cores. A
-        # padded table of neighbours took 1.9 ms, since the gradient of a gather is a scatter, and
+        # padded table of neighbors took 1.9 ms, since the gradient of a gather is a scatter, and
         # 0.8 with a hand-written transpose; a sparse matrix product took 1.9.
         first, second = self.edges[:, 0], self.edges[:, 1]
         total = jnp.zeros_like(vertices)
@@ -167,7 +167,7 @@ class Laplacian(Regularizer):
     laplacian: MeshLaplacian | None = None
 
     def prepared(self, body: BodyModel, people: int) -> "Laplacian":
-        """With the neighbours of the body's vertices."""
+        """With the neighbors of the body's vertices."""
         if self.laplacian is not None:
             return self
         found = MeshLaplacian.from_faces(np.asarray(body.faces), body.num_vertices)

@@ -52,16 +52,16 @@ def orientation_starts(objective: Objective, count: int) -> Float[Array, "count 
     total = jnp.maximum(jnp.sum(weights), jnp.finfo(dtype).tiny)
     center, focal = camera.center.astype(dtype)[None], camera.focal.astype(dtype)[None]
     image = (objective.keypoints - center) / focal
-    image_centre = jnp.sum(weights[:, None] * image, axis=0) / total
-    centre = jnp.sum(weights[:, None] * points, axis=0) / total
+    image_center = jnp.sum(weights[:, None] * image, axis=0) / total
+    body_center = jnp.sum(weights[:, None] * points, axis=0) / total
     views = jnp.asarray(_views(_NUM_VIEWS), dtype)
 
-    from_centre = image - image_centre[None]
-    target = _as_complex(weights[:, None] * from_centre)
-    seen = _as_complex(jnp.einsum("vij,kj->vki", views, points - centre[None]))
+    from_center = image - image_center[None]
+    target = _as_complex(weights[:, None] * from_center)
+    seen = _as_complex(jnp.einsum("vij,kj->vki", views, points - body_center[None]))
     overlap = jnp.sum(jnp.conj(seen) * target[None], axis=-1)
     size = jnp.sum(weights[None] * jnp.abs(seen) ** 2, axis=-1)
-    spread = jnp.sum(weights[:, None] * from_centre**2)
+    spread = jnp.sum(weights[:, None] * from_center**2)
     told = (size > 1e-6 * total) & (spread > 1e-12 * total)
     size = jnp.where(told, size, 1.0)
     scale = jnp.where(told, jnp.abs(overlap) / size, 1.0 / _USUAL)
@@ -74,10 +74,10 @@ def orientation_starts(objective: Objective, count: int) -> Float[Array, "count 
     chosen = _spread_out(score, turned, count)
 
     distance = jnp.clip(1 / scale[chosen], _NEAREST, _FARTHEST)
-    at = jnp.concatenate([image_centre, jnp.ones(1, dtype)])[None] * distance[:, None]
+    at = jnp.concatenate([image_center, jnp.ones(1, dtype)])[None] * distance[:, None]
     over = camera.rotation.astype(dtype).T
     root = over @ turned[chosen]
-    moved = at @ over.T - jnp.einsum("sij,j->si", root, centre - joints[0]) - joints[:1]
+    moved = at @ over.T - jnp.einsum("sij,j->si", root, body_center - joints[0]) - joints[:1]
 
     def packed(root, moved):
         pose = rest.at[0].set(axis_angle_from_matrix(root))
@@ -103,7 +103,7 @@ def _in_image(angle: Float[Array, "N"]) -> Float[Array, "N 3 3"]:
 
 def _views(count: int) -> Float[np.ndarray, "N 3 3"]:
     """Rotations from the body to cameras all around it: rows right, down and forward."""
-    # A spiral of equal areas; the golden angle keeps neighbouring turns apart.
+    # A spiral of equal areas; the golden angle keeps neighboring turns apart.
     k = np.arange(count) + 0.5
     height = 1 - 2 * k / count
     angle = np.pi * (1 + 5**0.5) * k

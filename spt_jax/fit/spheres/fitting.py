@@ -1,7 +1,7 @@
 """Spheres fitted to the parts of a body at rest; NumPy and SciPy only.
 
 Each part's volume is sampled on a grid of its own, so that a finger is seen as finely as a thigh.
-Spheres are chosen one by one: of a number of centres inside the part, the centre and radius that
+Spheres are chosen one by one: of a number of centers inside the part, the center and radius that
 cover the most of the part's volume not covered yet, less what lies outside of the body. Then each
 sphere in turn is chosen again, given the others.
 """
@@ -15,15 +15,15 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax.fit.spheres.surface_samples import Surface, sample_surface
 
-# Grid cells in a part's bounding box, and candidate centres. With 600 cells the embedded body's
-# spheres lay 7.3 mm from the skin on average, not 6.1; with 100 centres 6.6 mm.
+# Grid cells in a part's bounding box, and candidate centers. With 600 cells the embedded body's
+# spheres lay 7.3 mm from the skin on average, not 6.1; with 100 centers 6.6 mm.
 _CELLS = 800
 _PADDING = 0.1
 _MOST_CENTRES, _DEEPEST = 140, 0.9
 _DEEPENINGS = 5
 # What covering a sample is worth: outside the body as much as inside, so that a sphere neither
 # shrinks to an inscribed one nor swells, and the more the farther out in terms of the part's
-# thickness, or one sphere bulges out of the chest by 4 cm; in a neighbouring part a little less
+# thickness, or one sphere bulges out of the chest by 4 cm; in a neighboring part a little less
 # than nothing, since what stands out there moves when the joint bends.
 _OUTSIDE, _FAR_OUTSIDE, _NEIGHBOUR = -1.0, 4.0, -0.1
 # A further sphere must add this share of its part's volume, and of the body's: a finger's segment
@@ -34,7 +34,7 @@ _RADII = 48
 _SWEEPS = 2
 # Which samples of the surface a sphere follows: those nearer to it than this part of its radius.
 _SUPPORT, _FEWEST = 0.25, 30
-# Holds a centre to the mean of its support in directions that the support does not see.
+# Holds a center to the mean of its support in directions that the support does not see.
 _RIDGE = 1e-3
 
 
@@ -109,7 +109,7 @@ def fit_spheres(rest: Rest) -> Fitted:
 
 
 class _Samples(NamedTuple):
-    """A part's grid: its points, what covering each is worth, and the candidate centres."""
+    """A part's grid: its points, what covering each is worth, and the candidate centers."""
 
     points: Float[np.ndarray, "N 3"]
     worth: Float[np.ndarray, "N"]
@@ -141,7 +141,7 @@ def _sample_part(surface: Surface, rest: Rest, joint: int) -> _Samples | None:
     distance = np.linalg.norm(points - surface.points[nearest], axis=1)
     beyond = _OUTSIDE - _FAR_OUTSIDE * distance / distance[own].max()
     worth = np.where(own, 1.0, np.where(inside, np.where(near[part], _NEIGHBOUR, _OUTSIDE), beyond))
-    # Centres near the surface never win: the deepest seven tenths, evenly.
+    # Centers near the surface never win: the deepest seven tenths, evenly.
     deepest = np.argsort(-distance[own], kind="stable")
     last = np.ceil(_DEEPEST * len(deepest))
     chosen = np.unique(np.linspace(0, last - 1, _MOST_CENTRES).astype(np.int64))
@@ -167,11 +167,11 @@ def _deepened(surface: Surface, centers, step: float) -> Float[np.ndarray, "C 3"
 
 
 def _cover(samples: _Samples, share: float, least: float) -> list[tuple[np.ndarray, float]]:
-    """Centre and radius of each sphere of a part."""
+    """Center and radius of each sphere of a part."""
     square = (samples.points**2).sum(axis=1) - 2 * samples.centers @ samples.points.T
     square += (samples.centers**2).sum(axis=1)[:, None]
     apart = np.sqrt(np.maximum(square, 0.0))
-    # The worth of every radius, of _RADII for each centre, is one running sum of a histogram;
+    # The worth of every radius, of _RADII for each center, is one running sum of a histogram;
     # sorting the samples by their distance took twice as long.
     step = samples.limit / _RADII
     center, point = np.nonzero(apart < samples.limit[:, None])
@@ -208,7 +208,7 @@ def _cover(samples: _Samples, share: float, least: float) -> list[tuple[np.ndarr
 
 
 def _follow(surface: Surface, rest: Rest, joint, center, radius):
-    """Displacement of the centre and change of the radius, (4, B), for each shape coefficient.
+    """Displacement of the center and change of the radius, (4, B), for each shape coefficient.
 
     To first order a point of the sphere in direction u moves along u by u . dc + dr: least squares
     over the samples of the surface that lie on it, weighed by area.
@@ -236,7 +236,7 @@ def _follow(surface: Surface, rest: Rest, joint, center, radius):
 def _may_collide(rest: Rest, part, centers, radii) -> Bool[np.ndarray, "S S"]:
     """Above the diagonal: the pairs that are far along the limbs, and apart at rest.
 
-    Along the limbs is from centre to centre over the joints between, less the radii.
+    Along the limbs is from center to center over the joints between, less the radii.
     """
     counts = np.linalg.norm(centers[:, None] - centers, axis=-1) > radii[:, None] + radii
     steps = [_way(rest, joint) for joint in range(len(rest.parents))]

@@ -48,7 +48,7 @@ class BodySpheres(eqx.Module):
 
     Attributes:
         centers: at rest, of the mean shape, in metres.
-        center_shape_basis: displacement of each centre for one unit of each shape coefficient.
+        center_shape_basis: displacement of each center for one unit of each shape coefficient.
         radii: of the mean shape, in metres.
         radius_shape_basis: change of each radius likewise.
         counts: which pairs may collide; true above the diagonal only. Left out are spheres of one
@@ -221,7 +221,7 @@ def sphere_penalty(
     """How far the spheres of a posed body collide, as a loss.
 
     The sum over pairs (i, j) that may collide of max(0, reach - |c_i - c_j|)^2, the squared depth,
-    with reach = r_i + r_j, or the centres' distance at rest where the shape alone already brings
+    with reach = r_i + r_j, or the centers' distance at rest where the shape alone already brings
     the spheres together. So it is zero in the zero pose, for every shape. The paper says only
     "the intersection between spheres"; SMPLify's capsules are turned into Gaussians
     exp(-d^2 / (s_i^2 + s_j^2)), which push parts that do not touch. The depth is zero there and,
@@ -239,7 +239,7 @@ def sphere_penalty(
     Raises:
         TypeError, ValueError: as the body does.
 
-    Differentiation: every mode; finite everywhere, zero between spheres that share their centre.
+    Differentiation: every mode; finite everywhere, zero between spheres that share their center.
         Once differentiable in all, twice but where spheres begin to touch.
 
     Example:

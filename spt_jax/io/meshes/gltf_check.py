@@ -135,7 +135,7 @@ def gltf_extras(tree: dict[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]
     kept = {
         "materials": tree.get("materials"),
         "texture coordinates": "TEXCOORD_0" in keys,
-        "vertex colours": "COLOR_0" in keys,
+        "vertex colors": "COLOR_0" in keys,
     }
     dropped = {
         "normals": "NORMAL" in keys,

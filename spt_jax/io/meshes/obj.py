@@ -47,7 +47,7 @@ def read_obj(content: bytes) -> RawMesh:
                 positions.append([x, y, z])
                 vertex_lines.append(number)
                 if len(fields) >= 6:
-                    extras["vertex colours"] = None
+                    extras["vertex colors"] = None
             elif kind == "f":
                 polygon = [int(field.partition("/")[0]) for field in fields]
                 if len(polygon) < 3:

@@ -1,4 +1,4 @@
-"""Object file format, .off: positions and polygons, with colours or not.
+"""Object file format, .off: positions and polygons, with colors or not.
 
 trimesh 5.2 fails at polygons of five corners or more, and cuts quadrilaterals that are not convex
 on the wrong side.
@@ -31,7 +31,7 @@ def read_off(content: bytes) -> RawMesh:
     header = _HEADER.match(rows[0][0]) if rows else None
     if header is None:
         raise UnreadableError("it must begin with OFF")
-    texture, colour, normal, four, dimension = header.groups()
+    texture, color, normal, four, dimension = header.groups()
     if four or dimension:
         raise UnreadableError(f"{header[0]} has points in another space than that of three axes")
     if "BINARY" in rows[0]:
@@ -78,10 +78,10 @@ def read_off(content: bytes) -> RawMesh:
 
     tails = any(len(row) > 1 + n for row, n in zip(polygons, counts, strict=True))
     extras = {
-        "vertex colours": bool(colour),
+        "vertex colors": bool(color),
         "texture coordinates": bool(texture),
         "normals": bool(normal),
-        "face colours": tails,
+        "face colors": tails,
     }
     return RawMesh(
         vertices,

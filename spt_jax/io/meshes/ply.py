@@ -20,7 +20,7 @@ from spt_jax.io.meshes.raw import (
 _CORNERS = ("vertex_indices", "vertex_index")
 _EXTRAS = {
     "texture coordinates": {"s", "t", "u", "v", "texture_u", "texture_v", "texcoord"},
-    "colours": {"red", "green", "blue", "diffuse_red"},
+    "colors": {"red", "green", "blue", "diffuse_red"},
     "normals": {"nx", "ny", "nz"},
 }
 

@@ -107,8 +107,8 @@ def _points(part: Any) -> int:
 
 def _looks(parts: list[Any]) -> tuple[str, ...]:
     kinds = {getattr(getattr(part, "visual", None), "kind", None) for part in parts}
-    names = {"texture": "materials and texture coordinates", "vertex": "vertex colours"}
-    return tuple(name for kind, name in (names | {"face": "face colours"}).items() if kind in kinds)
+    names = {"texture": "materials and texture coordinates", "vertex": "vertex colors"}
+    return tuple(name for kind, name in (names | {"face": "face colors"}).items() if kind in kinds)
 
 
 def _from_draco(content: bytes) -> RawMesh:

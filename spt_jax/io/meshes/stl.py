@@ -57,7 +57,7 @@ def _binary(content: bytes, announced: int, expected: int) -> RawMesh:
     notes = ()
     if len(content) > expected:
         notes = (f"{len(content) - expected:,} bytes after the last triangle are left out",)
-    extras = ("attributes or colours of triangles",) if facets["attribute"].any() else ()
+    extras = ("attributes or colors of triangles",) if facets["attribute"].any() else ()
     corners = facets["corners"].reshape(-1, 3).astype(np.float64)
     return RawMesh(corners, _in_threes(corners), extras=extras, notes=notes)
 

@@ -1,4 +1,4 @@
-"""Meshes written to files: coloured by label to be looked at, or to the last digit."""
+"""Meshes written to files: colored by label to be looked at, or to the last digit."""
 
 import os
 from pathlib import Path
@@ -22,13 +22,13 @@ def write_mesh(
     faces: Int[Array | np.ndarray, "F 3"],
     labels: Int[Array | np.ndarray, " V"] | None = None,
 ) -> None:
-    """Write a mesh as .glb or .ply, atomically, with one colour a vertex that other programs show.
+    """Write a mesh as .glb or .ply, atomically, with one color a vertex that other programs show.
 
-    Clear vertices are warm grey, penetrating ones (+1) vermillion, inverted ones (-1) blue. A .ply
+    Clear vertices are warm gray, penetrating ones (+1) vermillion, inverted ones (-1) blue. A .ply
     stores positions as float32 where that holds all of them exactly, else as float64. A .glb, which
     knows float32 alone, stores them so; of a mesh far from the origin about its middle, and that as
-    a node's translation. glTF defines vertex colours as linear light, so a .glb holds the same
-    colours linearised.
+    a node's translation. glTF defines vertex colors as linear light, so a .glb holds the same
+    colors linearised.
 
     Args:
         path: the file; its suffix chooses the format.
@@ -58,10 +58,10 @@ def write_mesh(
     if suffix not in (".glb", ".ply"):
         raise ValueError(f"path must end in .glb or .ply: got {str(path)!r}")
     points, triangles, label = as_mesh_arrays(vertices, faces, labels)
-    colours = np.array([BODY_COLOR, PENETRATING_COLOR, INVERTED_COLOR], dtype=np.uint8)[label]
+    colors = np.array([BODY_COLOR, PENETRATING_COLOR, INVERTED_COLOR], dtype=np.uint8)[label]
     if suffix == ".glb":
-        colours = _linear_light(colours)
-    rgba = np.concatenate([colours, np.full((len(colours), 1), 255, np.uint8)], axis=1)
+        colors = _linear_light(colors)
+    rgba = np.concatenate([colors, np.full((len(colors), 1), 255, np.uint8)], axis=1)
     if suffix == ".glb":
         middle = np.eye(4)
         if not fits_single(points):
@@ -118,8 +118,8 @@ def write_shape(
 def _as_ply(points: np.ndarray, triangles: np.ndarray, rgba: np.ndarray) -> bytes:
     # trimesh 5.2 writes float32 whatever it is given.
     number, name = ("<f8", "double") if single_rounding(points) else ("<f4", "float")
-    corners = np.empty(len(points), [("position", number, 3), ("colour", "u1", 4)])
-    corners["position"], corners["colour"] = points, rgba
+    corners = np.empty(len(points), [("position", number, 3), ("color", "u1", 4)])
+    corners["position"], corners["color"] = points, rgba
     faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, triangles
     header = [
@@ -135,9 +135,9 @@ def _as_ply(points: np.ndarray, triangles: np.ndarray, rgba: np.ndarray) -> byte
     return ("\n".join(header) + "\n").encode() + corners.tobytes() + faces.tobytes()
 
 
-def _linear_light(colours: np.ndarray) -> np.ndarray:
+def _linear_light(colors: np.ndarray) -> np.ndarray:
     # The sRGB transfer function; glTF 2.0, section 3.7.2.1: COLOR_0 is linear.
-    value = colours / 255.0
+    value = colors / 255.0
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return np.round(255 * linear).astype(np.uint8)
 

@@ -151,6 +151,6 @@ def _barycentric(
     total = weights.sum(axis=0)
     weights /= np.where(total != 0, total, 1.0)
     np.clip(weights, 0.0, 1.0, out=weights)
-    # A triangle with no area on the screen was crossed by rounding alone: take its centre.
+    # A triangle with no area on the screen was crossed by rounding alone: take its center.
     whole = weights.sum(axis=0)
     return np.where(whole > 0, weights / np.where(whole > 0, whole, 1.0), 1.0 / 3.0).T

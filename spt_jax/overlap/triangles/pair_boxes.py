@@ -1,4 +1,4 @@
-"""Pairs of triangles whose boxes meet, by clusters of neighbours: the broad phase of `pairs.py`.
+"""Pairs of triangles whose boxes meet, by clusters of neighbors: the broad phase of `pairs.py`.
 
 Three levels of boxes, each around the eight below it:
 

@@ -14,7 +14,7 @@ around their centers, again and again:
 The left half takes half of the groups (then of the clusters), rounded up, so that only the last one
 has empty slots. All ranges of one depth are sorted by one `lexsort`. Triangles 64 times as large as
 the usual one, or 512 times, are laid out by themselves: one of them would blow up the box of its
-cluster. Centers are taken from all the shapes in which the mesh was seen, because neighbours in one
+cluster. Centers are taken from all the shapes in which the mesh was seen, because neighbors in one
 pose may be strewn over another; `pair_boxes.near_groups` asks for another layout where the last one
 suits a shape no more. `tests/helpers_reference.py` has the halving as a recursion.
 """
@@ -75,7 +75,7 @@ class Topology:
 
 @dataclass(frozen=True)
 class Layout:
-    """Triangles in clusters of `CLUSTER` neighbours, and as many clusters to a group.
+    """Triangles in clusters of `CLUSTER` neighbors, and as many clusters to a group.
 
     A cluster has slots for its triangles, some of which may be empty.
 

@@ -1,6 +1,6 @@
 """Which triangles of clusters that lie side by side share a vertex.
 
-Nearly all triangles whose boxes meet are neighbours on the surface. Which of them share a vertex
+Nearly all triangles whose boxes meet are neighbors on the surface. Which of them share a vertex
 follows from the faces alone, so the broad phase masks them before it lists what meets, instead of
 comparing the vertices of a hundred thousand pairs at every call.
 """

@@ -3,7 +3,7 @@
 Triangles that share a vertex are told apart by that vertex: if the triangles around it, seen
 along some direction, lie side by side, none of them meets another. That holds nearly everywhere,
 and is proved for all vertices at once; only where it is not are these pairs examined. Triangles
-that share no vertex are found by boxes: of clusters of neighbours, then of the triangles in them.
+that share no vertex are found by boxes: of clusters of neighbors, then of the triangles in them.
 What is left is decided by the signs of volumes, which are exact (`predicates.py`).
 """
 

@@ -136,7 +136,7 @@ def nodes_that_are_words(tree):
 
 
 def a_path_of_a_channel(tree):
-    tree["animations"][0]["channels"][0]["target"]["path"] = "colour"
+    tree["animations"][0]["channels"][0]["target"]["path"] = "color"
 
 
 def times_that_stand_still(tree):
