@@ -23,6 +23,8 @@ if typing.TYPE_CHECKING:
     from spt_jax.io.rigs.reading import RigFile as RigFile
     from spt_jax.io.rigs.reading import load_rig as load_rig
     from spt_jax.io.rigs.reading import load_rigs as load_rigs
+    from spt_jax.io.robots import Robot as Robot
+    from spt_jax.io.robots import load_robot as load_robot
     from spt_jax.keypoints.files import KeypointFile as KeypointFile
     from spt_jax.keypoints.files import read_keypoints as read_keypoints
 
@@ -33,11 +35,13 @@ __all__ = [
     "MotionFile",
     "RefusedPickleError",
     "RigFile",
+    "Robot",
     "Track",
     "load_body",
     "load_poses",
     "load_rig",
     "load_rigs",
+    "load_robot",
     "open_mesh",
     "open_poses",
     "read_keypoints",
@@ -68,6 +72,8 @@ __getattr__, __dir__ = _lazy_names(
         "Clip": "spt_jax.io.rigs.clips",
         "write_rig": "spt_jax.io.rigs.exporting",
         "RigFile": "spt_jax.io.rigs.reading",
+        "Robot": "spt_jax.io.robots",
+        "load_robot": "spt_jax.io.robots",
         "load_rig": "spt_jax.io.rigs.reading",
         "load_rigs": "spt_jax.io.rigs.reading",
         "KeypointFile": "spt_jax.keypoints.files",

@@ -29,6 +29,7 @@ from spt_jax.untangle.descent import (
     vertices_of,
 )
 from spt_jax.untangle.mesh import untangle_checked
+from spt_jax.untangle.sides import other_side
 from spt_jax.untangle.spread import Surface
 
 # Per cubic centimetre, against squared centimetres of displacement. The first is weak enough that
@@ -110,6 +111,9 @@ def untangle_pose(
     squares in the solver's variables. All joints move but the root: turning the whole body frees
     nothing. The overlap is that of the surface moved outwards by half of `margin`. Where the
     weights leave collisions, the last ones are tried again with two and four times the margin.
+    Where they still do, or the vertices moved by more than 60 mm (root mean square), a limb may
+    have passed through another part: it is swung to sides on which nothing collides, the nearest
+    of them are freed again, and what moves the body least is taken.
 
     Args:
         body: a `BodyModel`, a `RigModel`, or what `spt_jax.body.adapt` returns.
@@ -278,6 +282,10 @@ def _untangle_one(
             stuck = search.folds == "count" and idle >= 2 and weight >= _STRONG
             if search.is_free(after) or stuck:
                 break
+        side = other_side(search, body, (pose, shape, translation, factor), before, after)
+        if side is not None:
+            best, after, vertices = side.pose, side.found, side.vertices
+            steps, diverged = steps + side.steps, False
     free = search.is_free(after)
     if surface is not None and after.total_intersecting_pairs:
         sampling = Sampling(None, search.directions)
