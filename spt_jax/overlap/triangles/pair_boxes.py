@@ -230,12 +230,13 @@ def within_clusters(layout: Layout, shape: Shape, groups: Int[np.ndarray, "G"] |
 
 def across_groups(layout: Layout, shape: Shape, clusters: Boxes, groups: Pairs, marked=None):
     """Such pairs of different clusters, of pairs of groups."""
+    short = _short_words(shape, clusters)
     for a, b in groups:
         for c, d, row in _meeting_members(layout, clusters, a, b):
             if marked is not None:
                 kept = marked[c] | marked[d]
                 c, d, row = c[kept], d[kept], row[kept]
-            yield from _meeting_triangles(layout, shape, clusters, c, d, row)
+            yield from _meeting_triangles(layout, shape, clusters, short, c, d, row)
 
 
 def meeting_boxes(boxes: Boxes):
@@ -285,9 +286,8 @@ def _meeting_members(layout: Layout, clusters: Boxes, a, b):
             yield first, CLUSTER * q.take(at) + place, layout.sharing.row.take(of_group)
 
 
-def _meeting_triangles(layout: Layout, shape: Shape, boxes: Boxes, a, b, row):
+def _meeting_triangles(layout: Layout, shape: Shape, boxes: Boxes, short: _Short, a, b, row):
     """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
-    short = _short_words(shape, boxes)
     large = short.large.take(a) | short.large.take(b)
     for words, chosen in ((short, np.flatnonzero(~large)), (None, np.flatnonzero(large))):
         pairs = a.take(chosen), b.take(chosen), row.take(chosen)

@@ -55,6 +55,8 @@ from spt_jax.overlap.triangles.predicates import Predicates
 
 # Pairs of a ray and a triangle that are worked on together.
 _AT_ONCE = 1 << 20
+# For so few rays triangles are not sorted.
+_FEW_RAYS = 16
 
 
 @dataclass(frozen=True)
@@ -292,35 +294,46 @@ def _outermost_edges(topology: Topology, predicates: Predicates, vertex):
     return row, (topology.ends[row, 1] == vertex).astype(np.int64)
 
 
+def _range(places, faces):
+    """The least and the greatest of each triangle's corners along an axis."""
+    a, b, c = (places.take(corner) for corner in faces.T)
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
 def _rays(predicates: Predicates, faces, vertex, part, part_of_face):
     """Where rays along x from these vertices meet triangles of other parts: ray, triangle, sign.
 
     The sign is +1 where the ray leaves the triangle's solid: the sum of them is the winding number
     at the vertex.
     """
-    corner = predicates.points[:, faces]
-    low, high = corner.min(axis=2), corner.max(axis=2)
-    found = []
-    order = np.argsort(low[1], kind="stable")
-    ascending = low[1][order]
-    point = predicates.points[:, vertex]
-    # Triangles that begin below the ray in y and reach above it, in blocks of rays.
-    stop = np.searchsorted(ascending, point[1], side="right")
+    # In one place vertices follow their pushes, where that order is known.
+    places = vars(predicates).get("ranks", predicates.points)
+    point = places.take(vertex, axis=1)
+    low, high = _range(places[1], faces)
+    found = [np.zeros((2, 0), np.int64)]
+    order = ascending = None
+    if len(vertex) > _FEW_RAYS:
+        order = np.argsort(low, kind="stable")
+        ascending, low, high = low[order], low[order], high[order]
     each = max(_AT_ONCE // max(len(faces), 1), 1)
     for begin in range(0, len(vertex), each):
-        rays = np.arange(begin, min(begin + each, len(vertex)))
-        among = order[: stop[rays].max(initial=0)]
-        meet = (
-            (low[1, among] <= point[1, rays, None])
-            & (high[1, among] >= point[1, rays, None])
-            & (low[2, among] <= point[2, rays, None])
-            & (high[2, among] >= point[2, rays, None])
-            & (high[0, among] >= point[0, rays, None])
-            & (part_of_face[among] != part[rays, None])
-        )
-        ray, at = np.nonzero(meet)
-        found.append((rays[ray], among[at]))
-    ray, face = (np.concatenate(x) for x in zip(*found, strict=True))
+        y = point[1, begin : begin + each]
+        # Triangles that begin below a ray in y and reach above it, in blocks of rays.
+        stop = len(low)
+        if ascending is not None:
+            stop = int(np.searchsorted(ascending, y.max(), side="right"))
+        ray, at = np.nonzero((low[:stop] <= y[:, None]) & (high[:stop] >= y[:, None]))
+        found.append(np.stack([ray + begin, at if order is None else order[at]]))
+    ray, face = np.concatenate(found, axis=1)
+    kept = np.flatnonzero(part_of_face[face] != part[ray])
+    ray, face = ray[kept], face[kept]
+    for axis in (2, 0):
+        low, high = _range(places[axis], faces[face])
+        beside = high >= point[axis, ray]
+        if axis == 2:
+            beside &= low <= point[axis, ray]
+        kept = np.flatnonzero(beside)
+        ray, face = ray[kept], face[kept]
     start, end = faces[face].T.ravel(), faces[face][:, [1, 2, 0]].T.ravel()
     turn = predicates.area(np.tile(vertex[ray], 3), start, end, (1, 2)).reshape(3, -1)
     kept = np.flatnonzero(np.abs(turn.sum(axis=0)) == 3)
