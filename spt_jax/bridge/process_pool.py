@@ -11,6 +11,7 @@ Whatever goes wrong with one, its work is done here: at once where it is gone or
 otherwise when it takes much longer than such work usually does, be it stopped, starved or slow.
 """
 
+import itertools
 import os
 import threading
 import time
@@ -113,21 +114,22 @@ class Workers:
     ) -> list[tuple[np.ndarray, ...]]:
         """The function of every mesh, in their order, whoever measured it."""
         found: list[Any] = [None] * len(meshes)
-        left = deque(range(len(meshes)))
         lost: list[int] = []
         shares = []
+        turns: list[deque[int]] = []
 
-        def taken() -> Iterator[int]:
+        def taken(own: deque[int]) -> Iterator[int]:
+            """Its own in their order; then the last ones of whoever has most left."""
             while True:
                 try:
-                    i = left.popleft()
+                    yield own.popleft() if own else max(turns, key=len).pop()
                 except IndexError:
-                    return
-                yield i
+                    if not any(turns):
+                        return
 
-        def share(worker: Worker, work: bytes) -> None:
+        def share(worker: Worker, work: bytes, own: deque[int]) -> None:
             with self._lent(worker):
-                for i in taken():
+                for i in taken(own):
                     lost.append(i)
                     found[i] = self._elsewhere(worker, work, meshes[i])
                     lost.remove(i)
@@ -135,17 +137,23 @@ class Workers:
         begin = time.perf_counter()
         size = sum(len(faces) for _, faces in meshes)
         work = packed(function, options) if size > _WORTH_SHARING else None
+        workers = [] if work is None else self._ready(work, len(meshes) - 1)
+        # Each process has the same meshes in every call, which it knows from the last one: those of
+        # a batch that moves a little (`overlap/triangles/warm_pairs.py`).
+        workers.sort(key=lambda worker: worker.number)
+        bounds = np.linspace(0, len(meshes), len(workers) + 2).astype(int).tolist()
+        turns += [deque(range(*ends)) for ends in itertools.pairwise(bounds)]
         try:
-            if work is not None:
-                for worker in self._ready(work, len(meshes) - 1):
-                    try:
-                        shares.append(executor().submit(share, worker, work))
-                    except RuntimeError:  # the interpreter is leaving and takes no more work
-                        self._release(worker)
-            for i in taken():
+            for worker, own in zip(workers, turns[1:], strict=True):
+                try:
+                    shares.append(executor().submit(share, worker, work, own))
+                except RuntimeError:  # the interpreter is leaving and takes no more work
+                    self._release(worker)
+            for i in taken(turns[0]):
                 found[i] = self._here(function, options, meshes[i], work)
         finally:
-            left.clear()
+            for own in turns:
+                own.clear()
             for ended in shares:
                 ended.result()
             self._spent += time.perf_counter() - begin

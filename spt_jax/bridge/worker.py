@@ -8,6 +8,7 @@ connection closes or its parent is gone.
 import copyreg
 import functools
 import io
+import itertools
 import json
 import os
 import pickle
@@ -35,6 +36,8 @@ _GIVEN_UP = 60.0
 # Seconds that are spent on telling it what its work is.
 _TOLD = 0.1
 
+_numbers = itertools.count()
+
 # How many functions with their options a worker remembers.
 _REMEMBERED = 8
 
@@ -61,9 +64,14 @@ class LateError(Exception):
 
 
 class Worker:
-    """One process, for one thread at a time. It begins to start when it is made."""
+    """One process, for one thread at a time. It begins to start when it is made.
+
+    Attributes:
+        number: in the order in which they were made.
+    """
 
     def __init__(self):
+        self.number = next(_numbers)
         ours, theirs = socket.socketpair()
         environment = os.environ | {
             "OMP_NUM_THREADS": "1",

@@ -86,6 +86,25 @@ def check(pool, executor, meshes, options=OPTIONS):
         np.testing.assert_array_equal(gradient, expected[1])
 
 
+def test_each_process_begins_with_the_same_meshes(pool, executor, monkeypatch):
+    """Those it knows from the last call: a batch's meshes move a little from one to the next."""
+    check(pool, executor, batch(2))
+    worker = until_ready(pool)
+    asked, measure = [], type(worker).measure
+
+    def noting(self, work, mesh, patience):
+        asked.append(mesh[0])
+        return measure(self, work, mesh, patience)
+
+    monkeypatch.setattr(type(worker), "measure", noting)
+    for _ in range(3):
+        meshes = batch(8)
+        asked.clear()
+        check(pool, executor, meshes)
+        assert 0 < len(asked) < 8
+        assert asked[0] is meshes[4][0]  # the first of its half
+
+
 def test_same_bits_as_here_with_new_faces_and_options(pool, executor, monkeypatch):
     check(pool, executor, batch())  # while it starts, all is done here
     answers = count_answers(until_ready(pool), monkeypatch)

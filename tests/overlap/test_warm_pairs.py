@@ -108,7 +108,8 @@ def unseen(mesh, vertices):
     """What is left to look at of a shape, and the crossings of a first call that it leaves out."""
     faces, left = mesh.topology.faces, None
     signs = Predicates(vertices, faces)
-    left = warm_pairs.left_of(mesh, signs.points, signs.scale)
+    near = warm_pairs.nearest(mesh, signs.points, signs.scale)
+    left = warm_pairs.left_of(mesh, near, signs.points)
     if left is None:
         return None, 0
     slot = left.layout.slot

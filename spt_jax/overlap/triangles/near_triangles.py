@@ -37,7 +37,7 @@ from spt_jax.overlap.triangles.pair_boxes import (
 from spt_jax.overlap.triangles.pair_layout import Layout, Prepared
 from spt_jax.overlap.triangles.pair_planes import not_apart
 from spt_jax.overlap.triangles.predicates import Predicates
-from spt_jax.overlap.triangles.warm_pairs import Left, keep, left_of
+from spt_jax.overlap.triangles.warm_pairs import Left, keep, left_of, nearest
 
 # Upper bound on face pairs that the plane of neither face separates. A mesh with more is noise, and
 # the list would exhaust memory: a body of 24,540 triangles has 1,800, with joints turned by 2 rad
@@ -74,9 +74,11 @@ class NearTriangles:
         self._near: list[Int[np.ndarray, "2 _"]] | None = None
         self._left = None
         if touching is None:
-            self._left = left_of(mesh, predicates.points, predicates.scale)
+            points, scale = predicates.points, predicates.scale
+            near = nearest(mesh, points, scale)
+            self._left = left_of(mesh, near, points)
             if self._left is None:
-                self._left = keep(mesh, predicates.points, predicates.scale, self._boxes[:3])
+                self._left = keep(mesh, near, points, scale, self._boxes[:3])
 
     @cached_property
     def layout(self) -> Layout:

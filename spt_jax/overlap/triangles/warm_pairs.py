@@ -104,6 +104,7 @@ class Kept:
         scale: what coordinates had been multiplied by.
         points: the vertices.
         growth: by how much two boxes together are grown.
+        some: a few of the vertices.
         calm: how many calls before were near this shape, or near one that was, and so on.
         apart: what is apart; None where only the points are kept.
     """
@@ -112,6 +113,7 @@ class Kept:
     scale: float
     points: Float[np.ndarray, "3 V"]
     growth: float
+    some: Float[np.ndarray, "3 N"]
     calm: int = 0
     apart: Apart | None = None
 
@@ -133,9 +135,14 @@ class Left:
     groups: Int[np.ndarray, "2 G"]
 
 
-def left_of(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float) -> Left | None:
-    """What is left to look at of a shape; None if nothing is known of one near it."""
-    near = _nearest(mesh, points, scale)
+def left_of(mesh: Prepared, near: Kept | None, points: Float[np.ndarray, "3 V"]) -> Left | None:
+    """What is left to look at of a shape; None if nothing is known of one near it.
+
+    Args:
+        mesh: what is known of the mesh.
+        near: what is kept of a shape near it.
+        points: the vertices.
+    """
     if near is None or near.apart is None:
         return None
     found = _left_of(near, near.apart, points)
@@ -173,32 +180,32 @@ def _left_of(kept: Kept, apart: Apart, points: Float[np.ndarray, "3 V"]) -> Left
     return Left(layout, pairs, np.flatnonzero(marked), apart.groups[:, far])
 
 
-def _nearest(mesh: Prepared, points, scale: float) -> Kept | None:
+def nearest(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float) -> Kept | None:
     """Of what is kept the first that is so near that groups are worth a look."""
-    for kept in mesh.kept:
-        if kept.layout is mesh.layout and kept.scale == scale and _is_near(kept, points):
-            return kept
-    return None
-
-
-def _is_near(kept: Kept, points) -> bool:
+    known = [one for one in mesh.kept if one.layout is mesh.layout and one.scale == scale]
+    if not known:
+        return None
     # A few vertices tell nearly all that are not.
-    for step in (_SOME, 1):
-        moved = points[:, ::step] - kept.points[:, ::step]
-        if not np.ptp(moved, axis=1).max() <= _FAR * kept.growth:
-            return False
-    return True
+    moved = points[:, ::_SOME] - np.stack([one.some for one in known])
+    for k, most in enumerate(np.ptp(moved, axis=2).max(axis=1).tolist()):
+        limit = _FAR * known[k].growth
+        if most <= limit and np.ptp(points - known[k].points, axis=1).max() <= limit:
+            return known[k]
+    return None
 
 
 def _without(mesh: Prepared, kept: Kept) -> tuple[Kept, ...]:
     return tuple(one for one in mesh.kept if one is not kept)
 
 
-def keep(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float, boxes) -> Left | None:
+def keep(
+    mesh: Prepared, before: Kept | None, points: Float[np.ndarray, "3 V"], scale: float, boxes
+) -> Left | None:
     """Keep of a shape what is apart in it if ones near it were seen before, else its points alone.
 
     Args:
         mesh: keeps it.
+        before: what is kept of a shape near it.
         points: the vertices.
         scale: what their coordinates were multiplied by.
         boxes: the layout, triangles and clusters, as `near_groups` gives them.
@@ -209,10 +216,9 @@ def keep(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float, boxes) 
     layout, shape, clusters = boxes
     if clusters.low.shape[1] // CLUSTER > _MOST_GROUPS:
         return None
-    before = _nearest(mesh, points, scale)
     growth = (2 * _growth(clusters) - _ROUNDED) * shape.span / STEPS
-    calm = 0 if before is None else before.calm + 1
-    kept = Kept(layout, scale, points, growth, calm)
+    calm = 0 if before is None or before.apart is not None else before.calm + 1
+    kept = Kept(layout, scale, points, growth, points[:, ::_SOME].copy(), calm)
     if calm > min(2 ** max(mesh.waste - _SHAPES, 0) - 1, _MOST_PATIENCE):
         apart = _apart(mesh.topology, kept, shape, clusters)
         mesh.waste = mesh.waste + 1 if apart is not None else _SHAPES + _MOST_PATIENCE
