@@ -18,10 +18,10 @@ from spt_jax._result import Result, plain
 from spt_jax._status import RESULTS
 from spt_jax._steps import OnStep, Step
 from spt_jax.body import BodyModel
+from spt_jax.bridge.programs import program
 from spt_jax.fit.options import Numbers, Scene, Search, Stages, Start, Terms
 from spt_jax.fit.pose import fit_each
 from spt_jax.fit.problem.inputs import Keypoints, Person
-from spt_jax.fit.programs import program
 from spt_jax.fit.regularizers._base import Regularizer
 from spt_jax.fit.regularizers.spt import SelfIntersection
 from spt_jax.fit.result import FitResult, fit_result

@@ -13,10 +13,10 @@ from spt_jax._camera import PinholeCamera
 from spt_jax._report import intersection_report
 from spt_jax._steps import OnStep, Step
 from spt_jax.body import BodyModel
+from spt_jax.bridge.programs import program
 from spt_jax.fit.options import Numbers, Search, Stages, Start, Terms
 from spt_jax.fit.problem.inputs import Keypoints, Person
 from spt_jax.fit.problem.objective import Objective
-from spt_jax.fit.programs import program
 from spt_jax.fit.regularizers._base import Regularizer
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.search.candidates import Candidates

@@ -14,6 +14,7 @@ from spt_jax._penalty import self_intersection_penalty
 from spt_jax._status import RESULTS
 from spt_jax._steps import OnStep, Step
 from spt_jax.body import AbstractBody, BodyGroup
+from spt_jax.bridge.programs import program
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
@@ -90,7 +91,7 @@ class Search(eqx.Module):
         return [(self.margin, weight) for weight in self.weights] + again
 
 
-@eqx.filter_jit
+@program
 def vertices_of(body, pose, shape, translation) -> Float[Array, "V 3"]:
     """The vertices of a posed body."""
     return body(pose, shape, translation).vertices
@@ -101,7 +102,7 @@ def faces_of(body: AbstractBody) -> Int[np.ndarray, "F 3"]:
     return np.asarray(body.faces, np.int64)
 
 
-@eqx.filter_jit
+@program
 def displacement_factor(body, pose, shape):
     """Cholesky factor of the quadratic form: free rows -> mean squared displacement."""
     if isinstance(body, BodyGroup) and body.count > 1:
@@ -142,7 +143,7 @@ def _objective(search: Search, moved, arguments):
     return jnp.sum(moved**2) + weight * volume / CENTIMETRE**3
 
 
-@eqx.filter_jit
+@program
 def descend(search: Search, body, fixed, moved, margin, weight):
     """One run of the solver, compiled as a whole.
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spt_jax.fit import programs
-from spt_jax.fit.programs import program
+from spt_jax.bridge import programs
+from spt_jax.bridge.programs import program
 
 
 @pytest.fixture
