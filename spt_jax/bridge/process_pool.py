@@ -145,6 +145,8 @@ class Workers:
         turns += [deque(range(*ends)) for ends in itertools.pairwise(bounds)]
         try:
             for worker, own in zip(workers, turns[1:], strict=True):
+                if work is None:
+                    break
                 try:
                     shares.append(executor().submit(share, worker, work, own))
                 except RuntimeError:  # the interpreter is leaving and takes no more work

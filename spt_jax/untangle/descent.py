@@ -129,6 +129,10 @@ def turned(body, pose, factor, moved):
     return pose.at[free].add(CENTIMETRE * turn.reshape(pose[free].shape))
 
 
+# What is looked at between descents.
+pose_of = program(turned)
+
+
 def _objective(search: Search, moved, arguments):
     body, (pose, shape, translation, factor), margin, weight = arguments
     vertices = body(turned(body, pose, factor, moved), shape, translation).vertices

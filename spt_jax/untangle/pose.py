@@ -25,7 +25,7 @@ from spt_jax.untangle.descent import (
     descend_in_steps,
     displacement_factor,
     faces_of,
-    turned,
+    pose_of,
     vertices_of,
 )
 from spt_jax.untangle.mesh import untangle_checked
@@ -212,7 +212,7 @@ def untangle_pose(
         solver=solver or SOLVER,
         rest=rest,
     )
-    poses = pose.reshape(-1, *one)
+    poses = list(map(jnp.asarray, np.asarray(pose).reshape(-1, *one)))
     shapes = _per_pose("shape", shape, batch, len(poses))
     translations = _per_pose("translation", translation, batch, len(poses))
     surface = Surface(np.asarray(body.faces), body.num_vertices) if way == "remove" else None
@@ -222,7 +222,14 @@ def untangle_pose(
     ]
     if not found:
         raise ValueError(f"pose must hold at least one pose: got shape {pose.shape}.")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves).reshape(*batch, *leaves[0].shape), *found)
+    return jax.tree.map(lambda *leaves: _stacked(leaves, batch), *found)
+
+
+def _stacked(leaves: tuple[Array | np.ndarray, ...], batch: tuple[int, ...]) -> Array:
+    # In NumPy: of each shape JAX would compile a program.
+    return jnp.asarray(
+        np.stack([np.asarray(x) for x in leaves]).reshape((*batch, *leaves[0].shape))
+    )
 
 
 def _as_search_rays(rays: Any) -> Rays:
@@ -252,7 +259,7 @@ def _untangle_one(
     ended, diverged = RESULTS.successful, False
     if not search.is_free(before):
         factor = displacement_factor(body, pose, shape)
-        moved = jnp.zeros(factor.shape[:1], pose.dtype)
+        moved = jnp.asarray(np.zeros(factor.shape[:1], pose.dtype))
         idle = 0
         for stage, (margin, weight) in enumerate(search.attempts()):
             arguments = (
@@ -268,7 +275,7 @@ def _untangle_one(
             else:
                 there, taken, ended = descend_in_steps(*arguments, stage, steps, on_step)
             steps += int(taken)
-            candidate = turned(body, pose, factor, there)
+            candidate = pose_of(body, pose, factor, there)
             found = _measured(search, body, pose, candidate, shape, translation)
             if found is None:
                 diverged = True
@@ -306,7 +313,8 @@ def _untangle_one(
 
 def _measured(search: Search, body, pose, candidate, shape, translation):
     """The vertices and the overlap of a pose, or None where it has run away."""
-    if not float(jnp.max(jnp.linalg.norm(candidate - pose, axis=-1))) <= _MOST_TURN:  # NaN is not
+    turn = np.linalg.norm(np.asarray(candidate) - np.asarray(pose), axis=-1)
+    if not float(turn.max()) <= _MOST_TURN:  # NaN is not
         return None
     posed = vertices_of(body, candidate, shape, translation)
     try:
