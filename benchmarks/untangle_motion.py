@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from benchmarks.common import Table, progress, provenance, record_section
 from benchmarks.oracles import FAR, RestGraph, far_crossings
 from spt_jax import load_body, load_mocap, untangle_motion, untangle_pose
-from spt_jax.untangle.corrections import Frames, corrected
+from spt_jax.untangle.corrections import Frames, corrected, posed
 from spt_jax.untangle.feet import standing_feet
 
 # What the recordings are taken for, in frames a second.
@@ -155,7 +155,7 @@ def _judged(given, pose: np.ndarray, seconds, vertices, standing, judged, before
     changed = np.any(pose != given, axis=(1, 2))[judged]
     free[changed] = _far(after[judged][changed]) == 0
     slide = []
-    for foot, share in zip(standing.feet, standing.share.T, strict=True):
+    for foot, share in zip(standing.feet, standing.share[:, 0].T, strict=True):
         step = [
             np.linalg.norm(np.diff(v[:, foot].mean(axis=1), axis=0), axis=1)
             for v in (vertices, after)
@@ -186,15 +186,15 @@ def _smoothed(given, pose, sigma: float) -> np.ndarray:
 def _frames(pose) -> Frames:
     body = _world()[0]
     return Frames(
-        pose,
-        np.zeros((len(pose), body.num_shape), np.float32),
-        np.zeros((len(pose), 3), np.float32),
+        pose[:, None],
+        np.zeros((len(pose), 1, body.num_shape), np.float32),
+        np.zeros((len(pose), 1, 3), np.float32),
     )
 
 
 def _vertices(pose) -> np.ndarray:
     body = _world()[0]
-    parts = [np.asarray(body(b.pose).vertices)[:n] for n, b in _frames(pose).batches()]
+    parts = [np.asarray(posed(body, b))[:n] for n, b in _frames(pose).batches()]
     return np.concatenate(parts)
 
 

@@ -72,6 +72,10 @@ class MotionOverlap(Result):
             column[frames] = found
         return MotionOverlap(*columns)
 
+    def without_overlap(self) -> "MotionOverlap":
+        """As many frames in which nothing overlaps."""
+        return MotionOverlap(*(np.zeros_like(column) for column in self.columns()))
+
     def columns(self) -> tuple[np.ndarray, ...]:
         """All figures, in the order of the attributes."""
         return (

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from spt_jax._geometry import inflate
+from spt_jax._groups import join_bodies
 from spt_jax._penalty import self_intersection_penalty
 from spt_jax.body import AbstractBody
 from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
@@ -24,7 +25,7 @@ BATCH = 8
 
 
 class Frames(NamedTuple):
-    """The frames of a motion.
+    """The frames of a motion of P people with the same body, mostly one.
 
     Attributes:
         pose: axis-angle of each joint, in radians.
@@ -32,9 +33,14 @@ class Frames(NamedTuple):
         translation: of each frame, in metres.
     """
 
-    pose: Float[Array, "T J 3"] | Float[np.ndarray, "T J 3"]
-    shape: Float[Array, "T B"] | Float[np.ndarray, "T B"]
-    translation: Float[Array, "T 3"] | Float[np.ndarray, "T 3"]
+    pose: Float[Array, "T P J 3"] | Float[np.ndarray, "T P J 3"]
+    shape: Float[Array, "T P B"] | Float[np.ndarray, "T P B"]
+    translation: Float[Array, "T P 3"] | Float[np.ndarray, "T P 3"]
+
+    @property
+    def people(self) -> int:
+        """How many there are."""
+        return self.pose.shape[1]
 
     def at(self, frames: Int[np.ndarray, "N"]) -> "Frames":
         """Some of them, in arrays of NumPy: any number of frames is taken without a program."""
@@ -52,6 +58,14 @@ class Frames(NamedTuple):
             yield min(BATCH, count - start), self.at(at)
 
 
+def faces_of(body: AbstractBody, people: int) -> Int[np.ndarray, "F 3"]:
+    """The triangles of so many people as one mesh."""
+    faces = np.asarray(body.faces, np.int64)
+    if people == 1:
+        return faces
+    return np.concatenate([faces + k * body.num_vertices for k in range(people)])
+
+
 def corrected(
     pose: Float[Array, "*batch J 3"], turn: Float[Array, "*batch K 3"]
 ) -> Float[Array, "*batch J 3"]:
@@ -66,8 +80,8 @@ def corrected(
 
 
 def as_given(
-    pose: Float[np.ndarray, "T J 3"], like: Float[np.ndarray, "T J 3"]
-) -> Float[np.ndarray, "T J 3"]:
+    pose: Float[np.ndarray, "*batch 3"], like: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
     """The same rotations by those vectors that lie nearest to others: angles beyond pi stay so."""
     angle = np.linalg.norm(pose, axis=-1, keepdims=True)
     axis = pose / np.where(angle > 0, angle, 1.0)
@@ -77,60 +91,43 @@ def as_given(
 
 
 @eqx.filter_jit
-def _displacement_forms(body, frames: Frames, stride: int, feet, standing):
-    """For each frame the quadratic form: turns -> mean squared displacement."""
+def _displacement_forms(body, frames: Frames, stride: int):
+    """For each frame and person the quadratic form: turns -> mean squared displacement."""
     chosen = body.at_vertices(np.arange(0, body.num_vertices, stride))
-    feet = feet[:, ::stride]
-    size = jnp.maximum(feet.sum(axis=1), 1.0)
 
-    def form(pose, shape, standing):
+    def form(pose, shape):
         zero = jnp.zeros_like(pose[1:])
         jacobian = jax.jacfwd(lambda turn: chosen(corrected(pose, turn), shape).vertices)(zero)
-        jacobian = jacobian.reshape(-1, 3, zero.size)
-        weight = 1 / len(jacobian) + (standing / size) @ feet
-        flat = (jnp.sqrt(weight)[:, None, None] * jacobian).reshape(-1, zero.size)
-        return flat.T @ flat
+        flat = jacobian.reshape(-1, zero.size)
+        return flat.T @ flat / len(jacobian)
 
-    return jax.lax.map(lambda x: form(*x), (frames.pose, frames.shape, standing))
+    def of_frame(frame):
+        return jax.vmap(form)(*frame)
+
+    return jax.lax.map(of_frame, (frames.pose, frames.shape))
 
 
-def displacement_factor(
-    body: AbstractBody,
-    frames: Frames,
-    feet: Bool[np.ndarray, "K V"],
-    standing: Float[np.ndarray, "T K"],
-) -> Float[np.ndarray, "N N"]:
-    """Cholesky factor of the form: turns -> mean squared displacement, in a window's mean.
+def displacement_factors(body: AbstractBody, frames: Frames) -> Float[np.ndarray, "P N N"]:
+    """Of each person the Cholesky factor of: turns -> mean squared displacement.
 
-    One form for all frames of a window: a correction that is smooth in it is smooth in turns.
-
-    Args:
-        body: the body.
-        frames: those of the window.
-        feet: which vertices are of each foot.
-        standing: what the mean squared displacement of each foot weighs, in each frame.
+    One form for all frames of a window, their mean: a correction that is smooth in it is smooth in
+    turns.
     """
     count = len(frames.pose)
     spread = np.arange(min(_SAMPLED_FRAMES, count)) * (count - 1) // max(_SAMPLED_FRAMES - 1, 1)
     # As many from the end as from the start: a motion played backwards weighs the same.
     chosen = np.concatenate([spread, count - 1 - spread])
     stride = max(body.num_vertices // _SAMPLED_VERTICES, 1)
-    dtype = frames.pose.dtype
-    forms = _displacement_forms(
-        body,
-        frames.at(chosen),
-        stride,
-        jnp.asarray(feet, dtype),
-        jnp.asarray(standing[chosen], dtype),
-    )
+    forms = _displacement_forms(body, frames.at(chosen), stride)
     form = np.asarray(forms, np.float64).mean(axis=0)
-    return np.linalg.cholesky(form + STIFFNESS * np.eye(len(form)))
+    return np.linalg.cholesky(form + STIFFNESS * np.eye(form.shape[-1]))
 
 
 @eqx.filter_jit
 def posed(body, frames: Frames) -> Float[Array, "T V 3"]:
-    """The vertices of each frame."""
-    return body(frames.pose, frames.shape, frames.translation).vertices
+    """The vertices of each frame, those of all people one after the other."""
+    vertices = body(frames.pose, frames.shape, frames.translation).vertices
+    return vertices.reshape(len(vertices), -1, 3)
 
 
 @eqx.filter_jit
@@ -142,32 +139,75 @@ def _turned(frames: Frames, turn):
 def _overlaps(body, rest: RestSurface | None, frames: Frames, turn, margin):
     def overlap(turn, pose, shape, translation, margin):
         vertices = body(corrected(pose, turn), shape, translation).vertices
-        outer = inflate(vertices, body.faces, margin / 2)
-        volume = self_intersection_penalty(outer, body.faces, rest_surface=rest)
+        scene = join_bodies(vertices, body.faces)
+        outer = inflate(scene.vertices, scene.faces, margin / 2)
+        volume = self_intersection_penalty(outer, scene.faces, rest_surface=rest)
         return volume / CENTIMETRE**3
 
     return jax.vmap(jax.value_and_grad(overlap))(turn, *frames, margin)
 
 
 class Corrections(NamedTuple):
-    """How vectors become turns of one body's joints in one window.
+    """How vectors become turns of joints in one window.
 
-    A vector's squared length is the mean squared displacement in cm^2, to first order.
+    A vector's squared length is the mean squared displacement in cm^2, to first order; of several
+    people, the sum of theirs.
+
+    Attributes:
+        body: that of all people.
+        rest: the rest surface of all of them.
+        frames: those of the window.
+        factor, inverse: of each person, as `displacement_factors` has it.
     """
 
     body: AbstractBody
     rest: RestSurface | None
     frames: Frames
-    factor: Float[np.ndarray, "N N"]
+    factor: Float[np.ndarray, "P N N"]
+    inverse: Float[np.ndarray, "P N N"]
 
-    def turns(self, vectors: Float[np.ndarray, "T N"]) -> Float[np.ndarray, "T K 3"]:
+    @classmethod
+    def of(cls, body: AbstractBody, rest: RestSurface | None, frames: Frames) -> "Corrections":
+        """Those of some frames."""
+        factor = displacement_factors(body, frames)
+        return cls(body, rest, frames, factor, np.linalg.inv(factor))
+
+    @property
+    def size(self) -> int:
+        """How many numbers a frame's vector has."""
+        return self.factor.shape[0] * self.factor.shape[1]
+
+    def turns(self, vectors: Float[np.ndarray, "T N"]) -> Float[np.ndarray, "T P K 3"]:
         """Turns of the joints, in radians."""
-        turn = np.linalg.solve(self.factor.T, CENTIMETRE * vectors.T).T
-        return turn.reshape(len(vectors), -1, 3)
+        people, size, _ = self.factor.shape
+        of_person = CENTIMETRE * vectors.reshape(len(vectors), people, size)
+        turn = np.einsum("tpn,pnk->tpk", of_person, self.inverse, optimize=True)
+        return turn.reshape(len(vectors), people, size // 3, 3)
 
-    def vectors(self, turns: Float[np.ndarray, "T K 3"]) -> Float[np.ndarray, "T N"]:
+    def vectors(self, turns: Float[np.ndarray, "T P K 3"]) -> Float[np.ndarray, "T N"]:
         """The vectors of turns."""
-        return turns.reshape(-1, len(self.factor)) @ self.factor / CENTIMETRE
+        flat = turns.reshape(-1, len(self.factor), self.factor.shape[1])
+        return (
+            np.einsum("tpk,pkn->tpn", flat, self.factor, optimize=True).reshape(-1, self.size)
+            / CENTIMETRE
+        )
+
+    def slopes(self, by_turn: Float[np.ndarray, "*rows N"]) -> Float[np.ndarray, "*rows N"]:
+        """Derivatives by the vectors, of those by the turns."""
+        flat = by_turn.reshape(-1, len(self.factor), self.factor.shape[1])
+        found = np.einsum("tpn,pkn->tpk", flat, self.inverse, optimize=True)
+        return CENTIMETRE * found.reshape(by_turn.shape)
+
+    def batches(
+        self, chosen: Int[np.ndarray, "F"], turns: Float[np.ndarray, "F P K 3"]
+    ) -> Iterator[tuple[Int[np.ndarray, "B"], Frames, Array]]:
+        """Rows of `chosen`, their frames and turns, in batches of one size.
+
+        The last row again fills the last batch: one program does for any number.
+        """
+        for start in range(0, len(chosen), BATCH):
+            at = np.minimum(np.arange(start, start + BATCH), len(chosen) - 1)
+            yield at, self.frames.at(chosen[at]), jnp.asarray(turns[at], self.frames.pose.dtype)
 
     def overlaps(
         self,
@@ -182,33 +222,22 @@ class Corrections(NamedTuple):
             vectors: their corrections.
             margin: how far apart colliding parts are to be pushed, in metres.
         """
-        turns = self.turns(vectors)
         values, gradients = [], []
-        for start in range(0, len(chosen), BATCH):
-            # The last one again, which is measured once: one program does for any number.
-            at = np.minimum(np.arange(start, start + BATCH), len(chosen) - 1)
-            dtype = self.frames.pose.dtype
-            value, gradient = _overlaps(
-                self.body,
-                self.rest,
-                self.frames.at(chosen[at]),
-                jnp.asarray(turns[at], dtype),
-                jnp.asarray(margin[at], dtype),
-            )
+        for at, frames, turn in self.batches(chosen, self.turns(vectors)):
+            apart = jnp.asarray(margin[at], turn.dtype)
+            value, gradient = _overlaps(self.body, self.rest, frames, turn, apart)
             values.append(np.asarray(value, np.float64))
-            gradients.append(np.asarray(gradient, np.float64).reshape(BATCH, -1))
-        value = np.concatenate(values)[: len(chosen)]
+            gradients.append(np.asarray(gradient, np.float64).reshape(len(at), -1))
         by_turn = np.concatenate(gradients)[: len(chosen)]
-        return value, CENTIMETRE * np.linalg.solve(self.factor, by_turn.T).T
+        return np.concatenate(values)[: len(chosen)], self.slopes(by_turn)
 
     def poses(
         self, chosen: Int[np.ndarray, "F"], vectors: Float[np.ndarray, "F N"]
-    ) -> Float[np.ndarray, "F J 3"]:
+    ) -> Float[np.ndarray, "F P J 3"]:
         """The corrected poses of some frames, written as the poses given are."""
-        dtype = self.frames.pose.dtype
         given = np.asarray(self.frames.pose)[chosen]
-        padded = -(-len(chosen) // BATCH) * BATCH
-        at = np.minimum(np.arange(padded), len(chosen) - 1)
-        turns = jnp.asarray(self.turns(vectors)[at], dtype)
-        found = np.asarray(_turned(self.frames.at(chosen[at]), turns))[: len(chosen)]
-        return as_given(found, given)
+        parts = [
+            np.asarray(_turned(frames, turn))
+            for _, frames, turn in self.batches(chosen, self.turns(vectors))
+        ]
+        return as_given(np.concatenate(parts)[: len(chosen)], given)

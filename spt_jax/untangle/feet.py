@@ -22,11 +22,11 @@ class Standing(NamedTuple):
 
     Attributes:
         feet: which vertices are of each foot; of a body without joints of such names no foot.
-        share: of each frame and foot, 1 where it stands.
+        share: of each frame, person and foot, 1 where it stands.
     """
 
     feet: Bool[np.ndarray, "K V"]
-    share: Float[np.ndarray, "T K"]
+    share: Float[np.ndarray, "T P K"]
 
 
 def standing_feet(
@@ -45,20 +45,20 @@ def standing_feet(
         frames_per_second: its rate.
         up: the direction that is up, of length one.
         on_ground: whether the translation of the frames says where the ground is: at the lowest
-            place of the whole motion. Otherwise it is wherever the body is lowest in each frame,
+            place of the whole motion. Otherwise it is wherever each body is lowest in each frame,
             and how fast a foot is cannot be told.
     """
     feet = feet_of(body)
     if not len(feet):
-        return Standing(feet, np.zeros((len(frames.pose), 0)))
+        return Standing(feet, np.zeros((*frames.pose.shape[:2], 0)))
     known = tuple(tuple(np.flatnonzero(foot).tolist()) for foot in feet)
     parts = [
         [np.asarray(x)[:count] for x in _heights(body, batch, known, up.astype(frames.pose.dtype))]
         for count, batch in frames.batches()
     ]
     lowest, soles, middles = (np.concatenate(x) for x in zip(*parts, strict=True))
-    ground = lowest.min() if on_ground else lowest
-    low = soles - np.reshape(ground, (-1, 1)) < LOW
+    ground = lowest.min() if on_ground else lowest[..., None]
+    low = soles - ground < LOW
     if on_ground and len(middles) > 1:
         step = np.linalg.norm(np.diff(middles, axis=0), axis=-1) * frames_per_second
         # Slower than that to the frame before and to the one after.
@@ -86,10 +86,9 @@ def _is_below(parents: tuple[int, ...], joint: int, ancestor: int) -> bool:
 
 @eqx.filter_jit
 def _heights(body, frames: Frames, feet: tuple[tuple[int, ...], ...], up):
-    """Of each frame the lowest place, that of each foot, and the middle of each foot."""
-
+    """Of each frame and person the lowest place, that of each foot, and the middle of each foot."""
     vertices = body(*frames).vertices
     height = vertices @ up
-    soles = [height[:, np.array(foot)].min(axis=1) for foot in feet]
-    middles = [vertices[:, np.array(foot)].mean(axis=1) for foot in feet]
-    return height.min(axis=1), jnp.stack(soles, axis=1), jnp.stack(middles, axis=1)
+    soles = [height[..., np.array(foot)].min(axis=-1) for foot in feet]
+    middles = [vertices[..., np.array(foot), :].mean(axis=-2) for foot in feet]
+    return height.min(axis=-1), jnp.stack(soles, axis=-1), jnp.stack(middles, axis=-2)

@@ -35,12 +35,53 @@ class Prior(NamedTuple):
     """The smooth prior of a window, given what is fixed around it.
 
     Attributes:
-        kernel: K^-1 of the frames that are free.
+        matrix: K of the frames that are free.
+        kernel: K^-1.
         mean: the correction without any cuts, which the frames fixed before pass on.
     """
 
+    matrix: Float[np.ndarray, "T T"]
     kernel: Float[np.ndarray, "T T"]
     mean: Float[np.ndarray, "T N"]
+
+    def held(self, stiffness: Float[np.ndarray, "T"], place: Float[np.ndarray, "T N"]) -> "Prior":
+        """The prior with stiffness_t |y_t - place_t|^2 added."""
+        if not stiffness.any():
+            return self
+        matrix = self.matrix + np.diag(stiffness)
+        kernel = np.linalg.inv(matrix)
+        kernel = (kernel + kernel.T) / 2
+        pull = self.matrix @ self.mean + stiffness[:, None] * np.where(stiffness[:, None], place, 0)
+        return Prior(matrix, kernel, kernel @ pull)
+
+    def cost(self, vectors: Float[np.ndarray, "T N"]) -> float:
+        """What a correction costs beyond that of the mean."""
+        return float(np.sum((vectors - self.mean) * (self.matrix @ (vectors - self.mean))))
+
+
+class Ties(NamedTuple):
+    """Linear terms w (h + s . y_t)^2 that are no collisions: of what is to stay in place.
+
+    Attributes:
+        frame: t of each.
+        slope, height: s and h.
+        weight: w.
+    """
+
+    frame: Int[np.ndarray, "R"]
+    slope: Float[np.ndarray, "R N"]
+    height: Float[np.ndarray, "R"]
+    weight: Float[np.ndarray, "R"]
+
+    @staticmethod
+    def none(size: int) -> "Ties":
+        """No ties."""
+        return Ties(np.zeros(0, np.int64), np.zeros((0, size)), np.zeros(0), np.zeros(0))
+
+    def cost(self, vectors: Float[np.ndarray, "T N"]) -> float:
+        """The sum of the terms."""
+        reach = self.height + np.einsum("rn,rn->r", self.slope, vectors[self.frame])
+        return float(self.weight @ reach**2)
 
 
 def prior(
@@ -68,7 +109,8 @@ def prior(
     chosen = slice(before, before + free)
     kernel = np.linalg.inv(matrix[chosen, chosen])
     kernel = (kernel + kernel.T) / 2
-    return Prior(kernel, -kernel @ (matrix[chosen, :before] @ fixed_before))
+    mean = -kernel @ (matrix[chosen, :before] @ fixed_before)
+    return Prior(matrix[chosen, chosen], kernel, mean)
 
 
 class FrameCuts:
@@ -120,24 +162,55 @@ class FrameCuts:
         self.frame, self.slope = self.frame[kept], self.slope[kept]
         self.height, self.weight = self.height[kept], self.weight[kept]
 
-    def minimum(self, known: Prior, stiffness: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T N"]:
-        """The correction at which the cost over all cuts is least.
+    def reach(self, vectors: Float[np.ndarray, "T N"]) -> Float[np.ndarray, "T"]:
+        """Of each frame the highest cut at a place, or 0: what the root of its overlap may be."""
+        found = np.zeros(len(vectors))
+        said = self.height + np.einsum("cn,cn->c", self.slope, vectors[self.frame])
+        np.maximum.at(found, self.frame, said)
+        return found
+
+    def minimum(
+        self, known: Prior, stiffness: Float[np.ndarray, "T"], ties: Ties
+    ) -> Float[np.ndarray, "T N"]:
+        """The correction at which the cost over all cuts and ties is least.
 
         Args:
             known: the prior.
             stiffness: w_t of each frame.
+            ties: what else is asked of frames.
         """
-        if not len(self.frame):
+        count = len(self.frame)
+        frame = np.concatenate([self.frame, ties.frame])
+        if not len(frame):
             return known.mean
-        reach = np.einsum("cn,cn->c", self.slope, known.mean[self.frame])
-        matrix = (self.slope @ self.slope.T) * known.kernel[np.ix_(self.frame, self.frame)]
+        slope = np.concatenate([self.slope, ties.slope])
+        height = np.concatenate([self.height, ties.height])
+        wanted = 2 * (height + np.einsum("cn,cn->c", slope, known.mean[frame]))
+        matrix = (slope @ slope.T) * known.kernel[np.ix_(frame, frame)]
+        cut = slice(0, count)
         same = self.frame[:, None] == self.frame
-        matrix += np.where(same, 1 / stiffness[self.frame], 0.0)
+        matrix[cut, cut] += np.where(same, 1 / stiffness[self.frame], 0.0)
+        at = np.arange(count, len(frame))
+        matrix[at, at] += 1 / ties.weight
         matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
-        self.weight = nonnegative_minimum(matrix, 2 * (self.height + reach), self.weight > 0)
+        weight = _with_free(matrix, wanted, count, self.weight > 0)
+        self.weight = weight[cut]
         pull = np.zeros_like(known.mean)
-        np.add.at(pull, self.frame, self.weight[:, None] * self.slope)
+        np.add.at(pull, frame, weight[:, None] * slope)
         return known.mean - 0.5 * known.kernel @ pull
+
+
+def _with_free(matrix, wanted, count: int, positive):
+    """As `nonnegative_minimum`, where only the first `count` must not be negative."""
+    if count == len(matrix):
+        return nonnegative_minimum(matrix, wanted, positive)
+    cut, free = slice(0, count), slice(count, None)
+    both = np.column_stack([matrix[free, cut], wanted[free]])
+    solved = np.linalg.solve(matrix[free, free], both)
+    rest = matrix[cut, cut] - matrix[cut, free] @ solved[:, :-1]
+    left = wanted[cut] - matrix[cut, free] @ solved[:, -1]
+    weight = nonnegative_minimum((rest + rest.T) / 2, left, positive)
+    return np.concatenate([weight, solved[:, -1] - solved[:, :-1] @ weight])
 
 
 def nonnegative_minimum(

@@ -1,12 +1,12 @@
 """Freeing a motion of its collisions as a whole, so that what was smooth stays smooth."""
 
+import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from spt_jax._exclusions import as_fold_surface
@@ -16,35 +16,11 @@ from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax.body import AbstractBody
 from spt_jax.metrics import MotionOverlap
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.untangle.corrections import Corrections, Frames, displacement_factor
+from spt_jax.untangle.anchors import anchors_of, close_pairs
 from spt_jax.untangle.feet import standing_feet
-from spt_jax.untangle.frame_cuts import prior
-from spt_jax.untangle.motion_window import measured_poses, solve, windows
-
-# Calm frames that are moved along on either side of a collision, in units of the time in which a
-# correction fades: there it has come down to a twenty-fifth.
-_REACH = 5.0
-
-# The most frames for which one correction is found at once: so many of the same units, or at least
-# so many frames.
-_LONGEST, _SHORTEST = 60.0, 64
-
-
-class MotionStep(NamedTuple):
-    """One round of `untangle_motion` over a window: frames before `first` are done.
-
-    Attributes:
-        first, end: the window's first frame, and the one after its last.
-        round: how many corrections of the window were tried.
-        colliding: how many of its frames still collide.
-        frames: how many frames the motion has.
-    """
-
-    first: int
-    end: int
-    round: int
-    colliding: int
-    frames: int
+from spt_jax.untangle.kept_windows import KeptWindows
+from spt_jax.untangle.motion_input import as_contacts, as_frames, as_positive, as_up
+from spt_jax.untangle.motion_run import MotionStep, Run
 
 
 class MotionResult(Result):
@@ -56,14 +32,18 @@ class MotionResult(Result):
         moved: which frames were moved.
         rounds: over all windows, how often a correction was tried.
         status: of each frame, how it ended, one of `spt_jax.RESULTS`.
+        within, between: of several people, the overlap of each with themselves, and between them,
+            each before and after; volumes and pairs of both add up to all. None of one person.
     """
 
-    pose: Float[Array, "T J 3"]
+    pose: Float[Array, "T *people J 3"]
     before: MotionOverlap
     after: MotionOverlap
     moved: Bool[np.ndarray, "T"]
     rounds: int
     status: RESULTS
+    within: tuple[MotionOverlap, MotionOverlap] | None = None
+    between: tuple[MotionOverlap, MotionOverlap] | None = None
 
     @property
     def is_free(self) -> Bool[Array, "T"]:
@@ -77,6 +57,12 @@ class MotionResult(Result):
 
     def as_dict(self) -> dict[str, Any]:
         """All but the poses, as JSON types."""
+        apart = {
+            f"{name}_{when}": overlap.as_dict()
+            for name, both in (("within", self.within), ("between", self.between))
+            if both is not None
+            for when, overlap in zip(("before", "after"), both, strict=True)
+        }
         return {
             "frames": len(self.moved),
             "free_frames": int(np.count_nonzero(np.asarray(self.is_free))),
@@ -86,22 +72,27 @@ class MotionResult(Result):
             "after": self.after.as_dict(),
             "status": names_of(self.status),
             "moved": plain(self.moved),
+            **apart,
         }
 
 
 def untangle_motion(
     body: AbstractBody,
-    poses: Float[Array, "T J 3"] | Float[np.ndarray, "T J 3"],
+    poses: Float[Array, "T *people J 3"] | Float[np.ndarray, "T *people J 3"],
     *,
     shape: Float[Array, "*T B"] | Float[np.ndarray, "*T B"] | None = None,
     translation: Float[Array, "*T 3"] | Float[np.ndarray, "*T 3"] | None = None,
     frames_per_second: float = 30.0,
-    fade: float = 0.05,
+    fade: float = 0.02,
     fold_distance: float | None = None,
     margin: float = 0.002,
-    feet: float = 1.0,
+    feet: float = 20.0,
+    contacts: Any = None,
+    contact_distance: float = 0.02,
+    contact_weight: float = 20.0,
     up: Any = (0.0, 1.0, 0.0),
     tolerance: float = 1e-9,
+    resume: str | os.PathLike[str] | None = None,
     on_step: Callable[[MotionStep], None] | None = None,
 ) -> MotionResult:
     """The motion nearest to the one given in which no body parts collide, as smooth as it was.
@@ -113,30 +104,43 @@ def untangle_motion(
         d_t + 2 s^2 d(first difference of the correction) + s^4 d(second difference) + w_t V_t
 
     is made small, s the time `fade` in frames, with weights w_t that grow where frames collide
-    until they do so no more. The correction is a turn of every joint but the root, in the axes of
+    until they do so no more; what feet and contacts
+    ask for is added. The correction is a turn of every joint but the root, in the axes of
     its own part, so that it moves along with the limb. Frames farther than five times `fade` from
     any collision come back unchanged to the bit; folds, the creases that skinning makes at
     armpits, elbows and groins, are left as they are.
 
     Args:
-        body: a `BodyModel`, a `RigModel`, or what `spt_jax.body.adapt` makes of a body with joints.
-        poses: axis-angle of each frame, in radians.
-        shape: shape coefficients, one vector or one a frame; held fixed.
-        translation: in metres, one vector or one a frame; held fixed.
+        body: a `BodyModel`, a `RigModel`, or what `spt_jax.body.adapt` makes of a body with joints;
+            of several people, that of all of them.
+        poses: axis-angle of each frame, in radians; (frames, people, J, 3) is a scene of several
+            people, who are freed of themselves and of each other together.
+        shape: shape coefficients, one vector or one a frame; of several people one for all, one a
+            person, or one for each person in each frame. Held fixed.
+        translation: in metres, likewise; several people must have one.
         frames_per_second: the motion's rate.
         fade: the time in which a correction comes and goes, in seconds. Longer is smoother and
             moves more frames.
         fold_distance: as in `untangle_pose`.
         margin: how far apart colliding parts are pushed, in metres.
-        feet: what the mean squared displacement of a foot that stands on the ground weighs, against
-            that of the whole skin; 0 lets feet go. A foot stands where it is within 5 cm of the
-            lowest place of the motion and slower than 0.3 m/s; without a translation, which
-            says neither, where it is within 5 cm of the frame's lowest vertex. A window of frames
-            has one weight, its mean.
+        feet: what the squared displacement in cm^2 of the middle of a foot that stands on the
+            ground weighs in a frame, against that of the whole skin; 0 lets feet go. A foot stands
+            where it is within 5 cm of the lowest place of the motion and slower than 0.3 m/s;
+            without a translation, which says neither, where it is within 5 cm of the frame's lowest
+            vertex.
+        contacts: contact that is wanted, as pairs of vertices, (contacts, 2), such as of a palm and
+            a hip; of several people numbered through, person * body.num_vertices + vertex. In
+            frames in which the two are within `contact_distance` of each other in the motion given,
+            the squared change of their difference in cm^2 weighs `contact_weight`.
+        contact_distance: in metres.
+        contact_weight: 0 lets contacts go.
         up: the direction that is up.
         tolerance: an overlap of this volume or less, in m^3, is none where nothing intersects.
-        on_step: called with a `MotionStep` after each round over a window; what it raises ends the
-            search.
+        resume: a folder in which what is done is kept, window by window, made where missing. A
+            call with the same arguments goes on there and comes to the same result to the bit,
+            however the one before ended; the folder stays, for you to remove.
+        on_step: called with a `MotionStep` after each round over a window, and after every 256
+            frames that are measured; what it raises ends the search.
 
     Returns:
         The poses with the fewest frames that collide of those measured in each window, never more
@@ -145,11 +149,12 @@ def untangle_motion(
         `spt_jax.config.processes = "auto"` shares them among the cores.
 
     Raises:
-        ValueError: poses that are not (frames, J, 3), or not finite (the first such frame is
-            named); shape or translation that is not finite or does not fit; a rate or fade that
-            is not positive and finite; a margin, fold_distance or weight of feet that is negative
-            or not finite; no direction up; a frame in which the body has no surface that could be
-            measured.
+        ValueError: poses that are not (frames, J, 3) or (frames, people, J, 3), or not finite (the
+            first such frame is named); several people without a translation; shape or translation
+            that is not finite or does not fit; a rate or fade that is not positive and finite; a
+            margin, fold_distance, distance or weight that is negative or not finite; no direction
+            up; contacts that are no pairs of vertices; a folder to resume in of another motion; a
+            frame in which the body has no surface that could be measured.
         TypeError: poses traced; options that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
@@ -162,129 +167,67 @@ def untangle_motion(
         >>> int(result.before.is_free.sum()), int(result.after.is_free.sum())
         (1, 3)
     """
-    frames = _as_frames(body, poses, shape, translation)
-    rate = _as_positive("frames_per_second", frames_per_second)
-    smoothness = _as_positive("fade", fade) * rate
-    apart, weight = as_margin(margin), _as_positive("feet", feet, zero=True)
-    exclusions = Exclusions(rest=as_fold_surface(body, fold_distance))
-    report = on_step or _nothing
-    count = len(frames.pose)
-    before = measured_poses(body, frames, exclusions, depth=True)
-    colliding = (before.intersecting_pairs > 0) | (before.volume > tolerance)
-    pose, turns = np.array(frames.pose), np.zeros((count, body.pose_shape[0] - 1, 3))
-    standing = standing_feet(body, frames, rate, _as_up(up), on_ground=translation is not None)
-    reach = int(np.ceil(_REACH * smoothness))
-    longest = max(int(_LONGEST * smoothness), 4 * reach, _SHORTEST)
-    rounds = 0
-    for first, end, kept, closed in windows(colliding, reach, longest):
-        chosen = np.arange(first, end)
-        part, share = frames.at(chosen), weight * standing.share[chosen]
-        factor = displacement_factor(body, part, standing.feet, share)
-        corrections = Corrections(body, exclusions.rest, part, factor)
-        earlier = corrections.vectors(turns[max(first - 2, 0) : first])
-        after = min(2, count - end) if closed else 0
-        solved = solve(
-            corrections,
-            prior(earlier, len(chosen), after, smoothness),
-            before.at(chosen),
-            exclusions,
-            apart,
-            float(tolerance),
-            lambda number, left, at=(first, end): report(MotionStep(*at, number, left, count)),
+    frames = as_frames(body, poses, shape, translation)
+    pairs = as_contacts(contacts, body, frames.people)
+    asked = _Asked(
+        rate=as_positive("frames_per_second", frames_per_second),
+        fade=as_positive("fade", fade),
+        margin=as_margin(margin),
+        feet=as_positive("feet", feet, zero=True),
+        contact_distance=as_positive("contact_distance", contact_distance, zero=True),
+        contact_weight=as_positive("contact_weight", contact_weight, zero=True),
+        tolerance=float(tolerance),
+    )
+    direction = as_up(up)
+    rest = as_fold_surface(body, fold_distance)
+    rest = rest if frames.people == 1 else rest.copies(frames.people)
+    made_from = [*asked, direction, pairs, rest.distances, *frames, *jax.tree.leaves(body)]
+    made_from += [str(jax.tree.structure(body)), translation is None]
+    kept = KeptWindows(resume, made_from)
+    run = Run(body, frames, Exclusions(rest=rest), kept, on_step or _nothing)
+    before = run.measured("before", "measuring", np.arange(len(frames.pose)), frames.pose)
+    colliding = (before.intersecting_pairs > 0) | (before.volume > asked.tolerance)
+    pose, turns, rounds = np.array(frames.pose), None, 0
+    if colliding.any():
+        standing = standing_feet(
+            body, frames, asked.rate, direction, on_ground=translation is not None
         )
-        keep = slice(0, kept - first)
-        pose[first:kept] = solved.pose[keep]
-        turns[first:kept] = corrections.turns(solved.vectors)[keep]
-        rounds += solved.rounds
-    moved = np.any(turns != 0, axis=(1, 2))
-    after = _after(body, frames, pose, moved, before, exclusions)
-    free = (after.intersecting_pairs == 0) & (after.volume <= tolerance)
+        touching = close_pairs(body, frames, pairs, asked.contact_distance)
+        weights = asked.feet * standing.share, asked.contact_weight * touching
+        anchors = anchors_of(body, frames, standing.feet, weights[0], pairs, weights[1])
+        pose, turns, rounds = run.freed(before, colliding, anchors, asked)
+    moved = np.zeros(len(pose), bool) if turns is None else np.any(turns != 0, axis=(1, 2, 3))
+    after = before
+    if moved.any():
+        at = np.flatnonzero(moved)
+        after = before.with_frames(at, run.measured("after", "checking", at, pose[at]))
+    free = (after.intersecting_pairs == 0) & (after.volume <= asked.tolerance)
     return MotionResult(
-        pose=jnp.asarray(pose),
+        pose=jnp.asarray(pose).reshape(jnp.shape(poses)),
         before=before,
         after=after,
         moved=moved,
         rounds=rounds,
         status=jax.vmap(_status)(jnp.asarray(free)),
+        **({} if frames.people == 1 else run.counted_apart(pose, before, after)),
     )
+
+
+class _Asked(NamedTuple):
+    """Numbers of `untangle_motion`, checked; `fade` in seconds."""
+
+    rate: float
+    fade: float
+    margin: float
+    feet: float
+    contact_distance: float
+    contact_weight: float
+    tolerance: float
 
 
 def _status(free: Bool[Array, ""]) -> Any:
     found: Any = RESULTS.successful
     return RESULTS.where(free, found, RESULTS.intersections_left)
-
-
-def _after(body, frames: Frames, pose, moved, before: MotionOverlap, exclusions) -> MotionOverlap:
-    """The overlap of the motion found; of frames that did not move, what it was."""
-    at = np.flatnonzero(moved)
-    if not len(at):
-        return before
-    found = measured_poses(body, frames.at(at)._replace(pose=pose[at]), exclusions, depth=True)
-    return before.with_frames(at, found)
-
-
-def _as_frames(body: AbstractBody, poses: Any, shape: Any, translation: Any) -> Frames:
-    if isinstance(poses, Tracer):
-        raise TypeError(
-            "poses must be known: got a traced array; untangle_motion decides by the values that "
-            "it sees, so call it outside jit, vmap and grad."
-        )
-    pose = jnp.asarray(poses)
-    if not body.pose_is_rotations:
-        raise ValueError(
-            "body must have a pose that is rotations of joints, (J, 3): got one with poses of "
-            f"shape {body.pose_shape}; free its frames one by one with untangle_pose."
-        )
-    if pose.ndim != 3 or pose.shape[1:] != body.pose_shape or not len(pose):
-        raise ValueError(
-            f"poses must have shape (frames, {body.pose_shape[0]}, 3), at least one frame: got "
-            f"{pose.shape}; body.pose_from_smpl converts poses of other joint counts."
-        )
-    shapes = _per_frame("shape", shape, len(pose), body.num_shape if shape is None else None)
-    places = _per_frame("translation", translation, len(pose), 3)
-    _check_finite(poses=pose, shape=shapes, translation=places)
-    dtype = pose.dtype
-    return Frames(np.asarray(pose), np.asarray(shapes, dtype), np.asarray(places, dtype))
-
-
-def _per_frame(name: str, array: Any, count: int, size: int | None) -> Float[Array, "T B"]:
-    if array is None:
-        return jnp.zeros((count, size or 0))
-    given = jnp.asarray(array)
-    if given.ndim not in (1, 2) or (given.ndim == 2 and len(given) != count):
-        raise ValueError(
-            f"{name} must be one vector, or one for each of {count} frames: got shape "
-            f"{given.shape}."
-        )
-    if size is not None and given.shape[-1] != size:
-        raise ValueError(f"{name} must have {size} numbers a frame: got shape {given.shape}.")
-    return jnp.broadcast_to(given, (count, given.shape[-1]))
-
-
-def _check_finite(**arrays: Array) -> None:
-    for name, array in arrays.items():
-        wrong = np.flatnonzero(~np.isfinite(np.asarray(array)).reshape(len(array), -1).all(axis=1))
-        if len(wrong):
-            raise ValueError(
-                f"{name} must be finite: got NaN or infinity in {len(wrong)} of {len(array)} "
-                f"frames, frame {wrong[0]} the first; leave such frames out, or fill them in."
-            )
-
-
-def _as_positive(name: str, value: Any, *, zero: bool = False) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} must be a number: got {value!r}.")
-    if not (0 < value < np.inf or (zero and value == 0)):
-        least = "not negative" if zero else "positive"
-        raise ValueError(f"{name} must be finite and {least}: got {value!r}.")
-    return float(value)
-
-
-def _as_up(up: Any) -> Float[np.ndarray, "3"]:
-    direction = np.asarray(up, np.float64)
-    if direction.shape != (3,) or not 0 < np.linalg.norm(direction) < np.inf:
-        raise ValueError(f"up must be a direction, three numbers not all zero: got {up!r}.")
-    return direction / np.linalg.norm(direction)
 
 
 def _nothing(step: MotionStep) -> None:

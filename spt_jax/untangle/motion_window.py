@@ -8,21 +8,34 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax.metrics import MotionOverlap, measured_frames
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.untangle.corrections import Corrections, posed
+from spt_jax.untangle.anchors import Anchored, Anchors
+from spt_jax.untangle.corrections import Corrections, faces_of, posed
 from spt_jax.untangle.frame_cuts import FrameCuts, Prior
 
 # Rounds over a window. What a collision weighs, per cm^3 against cm^2, is first weak, so that poses
 # slide along the contact rather than jump out of it, and more from round to round in frames that
 # still collide; then the margin grows.
-_ROUNDS = 24
+_ROUNDS = 40
 _FIRST, _MORE, _LAST = 0.02, 3.0, 200.0
 _WIDER, _WIDEST = 1.5, 4.0
 
-# Rounds after which it is first looked whether frames are free.
+# Rounds after which it is first looked whether frames are free; and how many follow at the most
+# once all are, as long as each of them takes away more than this part of the cost.
 _UNCHECKED = 2
+_POLISHING, _WORTH = 3, 0.03
 
-# A frame moved by less than this since it was measured, in cm (rms), is not measured again.
-_MOVED = 0.003
+# A frame's weight grows where the model said how its last step would end: at most this much of the
+# root of its overlap, and this much, in cm^1.5, was not foreseen; or after so many rounds.
+_FORESEEN, _CLOSE, _PATIENCE = 1.5, 0.3, 2
+
+# How strongly a frame is held to its best place after a step that made things worse, in units of
+# the smooth prior's own stiffness, how much more after the next, and how much less after one that
+# did well (`contact_solver`).
+_HELD, _TIGHTER, _LOOSER = 1.0, 4.0, 0.25
+
+# A frame moved by less than this since it was measured, in cm (rms), is not measured again; and one
+# that was never seen to collide, which all that is moved is looked at for in the end.
+_MOVED, _CALM = 0.003, 0.1
 
 # A correction below this, in cm (rms), is none.
 _NOTHING = 1e-6
@@ -42,7 +55,7 @@ class Solved(NamedTuple):
     """
 
     vectors: Float[np.ndarray, "T N"]
-    pose: Float[np.ndarray, "T J 3"]
+    pose: Float[np.ndarray, "T P J 3"]
     overlap: MotionOverlap
     rounds: int
 
@@ -76,6 +89,7 @@ def windows(
 def solve(
     corrections: Corrections,
     known: Prior,
+    anchors: Anchors,
     before: MotionOverlap,
     exclusions: Exclusions,
     margin: float,
@@ -87,6 +101,7 @@ def solve(
     Args:
         corrections: how vectors move the window's frames.
         known: what is asked of the correction but for collisions.
+        anchors: what of the body is to stay.
         before: the overlap of the frames as they are given.
         exclusions: what does not count.
         margin: how far apart colliding parts are pushed, in metres.
@@ -94,114 +109,184 @@ def solve(
         on_round: called after each round.
 
     Returns:
-        The correction with the fewest frames that collide, and of those with the least overlap,
-        of those that were measured; none where that is no better than the frames given.
+        Of the corrections that were measured the one with the fewest frames that collide, of those
+        that leave none the least, of others the one with the least overlap; none where that is no
+        better than the frames given.
     """
-    search = _Search(corrections, before, exclusions, margin, tolerance)
-    vectors, best = known.mean, search.given(known)
-    rounds = 0
+    search = _Search(corrections, known, anchors, before, exclusions, margin, tolerance)
+    vectors, best = known.mean, search.given()
+    rounds, polishing = 0, _POLISHING
     for rounds in range(1, _ROUNDS + 1):
         search.learn(vectors)
-        if rounds > _UNCHECKED:
+        if rounds > _UNCHECKED or rounds == _ROUNDS:
             free = search.look(vectors)
             if free.all() or rounds == _ROUNDS:
-                best = min(best, search.candidate(vectors), key=_rank)
-                if best.free.all():
+                found = search.candidate(vectors)
+                gain = 1.0 - found.cost / best.cost if best.free.all() else 1.0
+                best = min(best, found, key=_rank)
+                polishing -= best.free.all()
+                if best.free.all() and (gain < _WORTH or not polishing):
                     break
             on_round(rounds, int(np.count_nonzero(~free)))
-        if rounds == _ROUNDS:
+        if rounds == _ROUNDS or not search.is_known():
             break
-        vectors = search.cuts.minimum(known, search.weight)
+        vectors = search.next(vectors)
     return Solved(best.vectors, best.pose, best.overlap, rounds)
 
 
 class _Candidate(NamedTuple):
     vectors: Float[np.ndarray, "T N"]
-    pose: Float[np.ndarray, "T J 3"]
+    pose: Float[np.ndarray, "T P J 3"]
     overlap: MotionOverlap
     free: Bool[np.ndarray, "T"]
+    cost: float
 
 
 def _rank(candidate: _Candidate) -> tuple[int, float]:
-    return int(np.count_nonzero(~candidate.free)), float(candidate.overlap.volume.sum())
+    left = int(np.count_nonzero(~candidate.free))
+    return left, float(candidate.overlap.volume.sum()) if left else candidate.cost
 
 
 class _Search:
     """What is known of a window's frames."""
 
-    def __init__(self, corrections, before, exclusions, margin, tolerance):
-        self._corrections, self._before = corrections, before
+    def __init__(self, corrections, known, anchors, before, exclusions, margin, tolerance):
+        self._corrections, self._known, self._before = corrections, known, before
         self._exclusions, self._tolerance = exclusions, tolerance
-        count, size = len(before.volume), len(corrections.factor)
+        count, size = len(before.volume), corrections.size
         self._margin, self._widest = np.full(count, margin), _WIDEST * margin
         self.cuts, self.weight = FrameCuts(size), np.full(count, _FIRST)
+        self._anchored = Anchored(corrections, anchors)
         # Where each frame was last measured; calm frames as given, where nothing was found.
+        self._active = ~self._is_free(before)
         self._place = np.zeros((count, size))
-        self._place[~self._is_free(before)] = np.nan
+        self._place[self._active] = np.nan
         self._value = np.zeros(count)
+        self._with_margin = np.zeros(count, bool)
+        # Where each frame was last found to be free, without a margin.
+        self._clear = np.full((count, size), np.nan)
+        # The root of the overlap that the model foresaw, and rounds in which it was wrong.
+        self._foreseen, self._surprised = np.zeros(count), np.zeros(count, np.int64)
+        # The best place of each frame, its overlap, and how strongly it is held there.
+        self._best, self._least = np.zeros((count, size)), np.full(count, np.inf)
+        self._held = np.zeros(count)
 
     def _is_free(self, overlap: MotionOverlap) -> Bool[np.ndarray, "T"]:
         return (overlap.intersecting_pairs == 0) & (overlap.volume <= self._tolerance)
 
-    def given(self, known: Prior) -> _Candidate:
+    def is_known(self) -> bool:
+        """Whether anything asks for a correction."""
+        return bool(len(self.cuts.frame)) or bool(self._known.mean.any())
+
+    def given(self) -> _Candidate:
         """The frames as they are given; with what earlier pieces of the run pass on, if any."""
-        if known.mean.any():
-            return self.candidate(known.mean)
+        mean = self._known.mean
+        if mean.any():
+            return self.candidate(mean)
         pose = np.asarray(self._corrections.frames.pose)
-        return _Candidate(known.mean, pose, self._before, self._is_free(self._before))
+        return _Candidate(mean, pose, self._before, self._is_free(self._before), np.inf)
 
     def learn(self, vectors) -> None:
         """Measure the frames that have moved."""
-        moved = ~(np.linalg.norm(vectors - self._place, axis=1) <= _MOVED)  # NaN has
+        far = np.where(self._active, _MOVED, _CALM)
+        moved = ~(np.linalg.norm(vectors - self._place, axis=1) <= far)  # NaN has
         frame = np.flatnonzero(moved)
         if not len(frame):
             return
         place = vectors[frame]
         value, gradient = self._corrections.overlaps(frame, place, self._margin[frame])
         usable = np.isfinite(value) & np.isfinite(gradient).all(axis=1)
-        self._place[frame], self._value[frame] = place, np.where(usable, value, np.inf)
+        value = np.where(usable, value, np.inf)
+        self._place[frame], self._value[frame] = place, value
+        self._with_margin[frame] = True
+        self._active[frame] |= value > 0
         self.cuts.learn(frame[usable], place[usable], value[usable], gradient[usable])
+        self._judge(frame, place, value)
+
+    def _judge(self, frame, place, value) -> None:
+        """Hold frames whose last step made things worse to the best place they had."""
+        root = np.sqrt(value)
+        wrong = root > _FORESEEN * self._foreseen[frame] + _CLOSE
+        self._surprised[frame] = np.where(wrong, self._surprised[frame] + 1, 0)
+        weight, best = self.weight[frame], self._best[frame]
+        cost = weight * value + np.einsum("fn,fn->f", place, place)
+        least = weight * self._least[frame] + np.einsum("fn,fn->f", best, best)
+        worse = (cost > least) & (value > self._least[frame])
+        stiff = _HELD / np.diag(self._known.kernel)[frame]
+        held = self._held[frame]
+        tighter = np.maximum(_TIGHTER * held, stiff)
+        looser = np.where(held > stiff, _LOOSER * held, 0.0)
+        self._held[frame] = np.where(worse, tighter, looser)
+        better = frame[~worse]
+        self._best[better], self._least[better] = place[~worse], value[~worse]
+
+    def next(self, vectors) -> Float[np.ndarray, "T N"]:
+        """Where the model is least."""
+        self._anchored.look(vectors)
+        known = self._known.held(self._held, self._best)
+        found = self.cuts.minimum(known, self.weight, self._anchored.ties())
+        self._foreseen = self.cuts.reach(found)
+        return found
 
     def look(self, vectors) -> Bool[np.ndarray, "T"]:
         """Which frames are free; those that are not weigh more from now on."""
-        free = np.ones(len(vectors), bool)
-        doubtful = np.flatnonzero(self._value > 0)
-        if len(doubtful):
-            pose = self._corrections.poses(doubtful, vectors[doubtful])
-            free[doubtful] = self._is_free(self._measured(doubtful, pose))
+        found = self._overlap(vectors, np.flatnonzero(self._value > 0))
+        free = self._is_free(found)
+        free[self._value == 0] = True
         self._press(~free)
         return free
 
     def _press(self, colliding: Bool[np.ndarray, "T"]) -> None:
-        full = colliding & (self.weight >= _LAST)
-        self.weight[colliding] = np.minimum(self.weight[colliding] * _MORE, _LAST)
+        chosen = colliding & ~((self._surprised > 0) & (self._surprised <= _PATIENCE))
+        full = chosen & (self.weight >= _LAST)
+        self.weight[chosen] = np.minimum(self.weight[chosen] * _MORE, _LAST)
         if full.any() and self._widest:
             self._margin[full] = np.minimum(self._margin[full] * _WIDER, self._widest)
             self._place[full] = np.nan
+            self._least[full] = np.inf
 
     def candidate(self, vectors) -> _Candidate:
-        """A correction, with every frame that it moves measured."""
+        """A correction, with what every frame that it moves comes to."""
         pose = np.array(self._corrections.frames.pose)
         size = np.linalg.norm(vectors, axis=1)
         vectors = np.where(size[:, None] > _NOTHING, vectors, 0.0)
         moved = np.flatnonzero(size > _NOTHING)
-        overlap = self._before
+        overlap = self._overlap(vectors, moved)
         if len(moved):
             pose[moved] = self._corrections.poses(moved, vectors[moved])
-            overlap = overlap.with_frames(moved, self._measured(moved, pose[moved]))
         free = self._is_free(overlap)
-        self._press(~free)
-        return _Candidate(vectors, pose, overlap, free)
+        fresh = ~free & ~self._active
+        self._active |= fresh
+        self._place[fresh] = np.nan
+        self._anchored.look(vectors)
+        cost = self._known.cost(vectors) + self._anchored.ties().cost(vectors)
+        return _Candidate(vectors, pose, overlap, free, cost)
 
-    def _measured(self, frame: Int[np.ndarray, "F"], pose) -> MotionOverlap:
-        corrections = self._corrections
-        frames = corrections.frames.at(frame)._replace(pose=pose)
-        return measured_poses(corrections.body, frames, self._exclusions, depth=False)
+    def _overlap(self, vectors, moved: Int[np.ndarray, "F"]) -> MotionOverlap:
+        """The overlap without a margin; of frames that did not move, what it was.
+
+        Nor is it measured where there was none, or near by none with the margin.
+        """
+        same = (vectors == self._clear).all(axis=1)
+        kept = self._with_margin & (self._value == 0)
+        kept &= np.linalg.norm(vectors - self._place, axis=1) <= _MOVED
+        known, wanted = (moved[(same | kept)[moved] == yes] for yes in (True, False))
+        nothing = self._before.at(known).without_overlap()
+        overlap = self._before.with_frames(known, nothing)
+        if len(wanted):
+            corrections = self._corrections
+            pose = corrections.poses(wanted, vectors[wanted])
+            frames = corrections.frames.at(wanted)._replace(pose=pose)
+            found = measured_poses(corrections.body, frames, self._exclusions, depth=False)
+            overlap = overlap.with_frames(wanted, found)
+            free = wanted[self._is_free(found)]
+            self._clear[free] = vectors[free]
+        return overlap
 
 
 def measured_poses(body, frames, exclusions: Exclusions, *, depth: bool) -> MotionOverlap:
     """The overlap of each frame; as `spt_jax.metrics` measures it."""
-    faces = np.asarray(body.faces, np.int64)
+    faces = faces_of(body, frames.people)
     parts = []
     for count, batch in frames.batches():
         vertices = np.asarray(posed(body, batch))

@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
-from spt_jax.untangle.frame_cuts import FrameCuts, nonnegative_minimum, prior
+from spt_jax.untangle.frame_cuts import FrameCuts, Ties, nonnegative_minimum, prior
 
 
-def cost(prior_matrix, cuts, stiffness, mean):
+def cost(prior_matrix, cuts, stiffness, mean, ties):
     def of(flat):
         y = flat.reshape(mean.shape)
         reach = np.zeros(len(y))
         said = cuts.height + np.einsum("cn,cn->c", cuts.slope, y[cuts.frame])
         np.maximum.at(reach, cuts.frame, said)
         smooth = np.einsum("tn,ts,sn->", y - mean, prior_matrix, y - mean)
-        return smooth + stiffness @ reach**2
+        tied = ties.height + np.einsum("rn,rn->r", ties.slope, y[ties.frame])
+        return smooth + stiffness @ reach**2 + ties.weight @ tied**2
 
     return of
 
@@ -31,8 +32,19 @@ def test_the_correction_is_the_least_one(rng):
             rng.uniform(0.1, 4.0, 6),
             rng.normal(size=(6, size)),
         )
-    of = cost(np.linalg.inv(known.kernel), cuts, stiffness, known.mean)
-    found = of(cuts.minimum(known, stiffness).ravel())
+    for rows in (0, 5):
+        frame = rng.integers(frames, size=rows)
+        slope, height = rng.normal(size=(rows, size)), rng.normal(size=rows)
+        ties = Ties(frame, slope, height, rng.uniform(0.5, 5.0, rows))
+        check_least(cuts, known, stiffness, ties)
+        held = rng.uniform(0.0, 3.0, frames) * (rng.random(frames) < 0.5)
+        check_least(cuts, known.held(held, rng.normal(size=(frames, size))), stiffness, ties)
+
+
+def check_least(cuts, known, stiffness, ties):
+    of = cost(known.matrix, cuts, stiffness, known.mean, ties)
+    np.testing.assert_allclose(known.matrix @ known.kernel, np.eye(len(known.mean)), atol=1e-9)
+    found = of(cuts.minimum(known, stiffness, ties).ravel())
     general = minimize(of, known.mean.ravel(), method="BFGS", options={"gtol": 1e-9})
     assert found <= general.fun * (1 + 1e-6)
     assert found == pytest.approx(general.fun, rel=1e-3)
@@ -81,3 +93,13 @@ def test_weights_are_never_negative(rng, count):
         found = nonnegative_minimum(matrix, wanted, start)
         np.testing.assert_allclose(found, general, atol=1e-7 * np.abs(general).max(initial=1.0))
         assert (found >= 0).all()
+
+
+def test_a_held_frame_stays_near_its_place(rng):
+    known = prior(np.zeros((0, 2)), 12, 0, 2.0)
+    place, held = rng.normal(size=(12, 2)), np.zeros(12)
+    assert known.held(held, place) is known
+    held[4] = 1e6
+    mean = known.held(held, np.where(held[:, None] > 0, place, np.nan)).mean
+    np.testing.assert_allclose(mean[4], place[4], rtol=1e-4)
+    assert np.abs(mean[-1]).max() < np.abs(mean[4]).max()

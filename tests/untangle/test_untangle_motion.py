@@ -12,7 +12,7 @@ from helpers import embedded_body, mocap
 from helpers_motion import second_differences, skin, snap, tongs
 
 from spt_jax import RESULTS, untangle_motion, untangle_pose
-from spt_jax.untangle import motion, motion_window
+from spt_jax.untangle import motion_run, motion_window
 from spt_jax.untangle.corrections import Frames, as_given, corrected
 from spt_jax.untangle.feet import feet_of, standing_feet
 from spt_jax.untangle.frame_cuts import FrameCuts
@@ -83,7 +83,7 @@ def test_one_frame_is_as_free_as_a_pose():
 def test_a_search_that_finds_nothing_changes_nothing(monkeypatch):
     """Corrections that press the arms together: the motion given comes back."""
 
-    def harmful(self, known, stiffness):
+    def harmful(self, known, stiffness, ties):
         count, size = known.mean.shape
         return known.mean + 0.1 * np.linspace(-1, 1, count * size).reshape(count, size)
 
@@ -99,12 +99,12 @@ def test_a_search_that_finds_nothing_changes_nothing(monkeypatch):
 
 @pytest.mark.slow
 def test_long_collisions_are_freed_in_pieces_without_a_seam(monkeypatch):
-    monkeypatch.setattr(motion, "_LONGEST", 30.0)
-    monkeypatch.setattr(motion, "_SHORTEST", 0)
+    monkeypatch.setattr(motion_run, "_LONGEST", 30.0)
+    monkeypatch.setattr(motion_run, "_SHORTEST", 0)
     body, steps = tongs(), []
     pose = snap(frames=60, width=25.0)
     result = untangle_motion(body, pose, frames_per_second=10.0, on_step=steps.append)
-    starts = sorted({step.first for step in steps})
+    starts = sorted({step.first for step in steps if step.stage == "freeing"})
     assert len(starts) > 1 and {step.frames for step in steps} == {60}
     assert np.asarray(result.is_free).all() and not crosses(body, skin(body, result.pose)).any()
     found = second_differences(skin(body, result.pose))
@@ -162,7 +162,7 @@ def test_feet_stand_where_they_are_low_and_slow():
 
     def share(translation, up, on_ground):
         frames = motion_frames(pose, translation)
-        return standing_feet(body, frames, 30.0, up, on_ground=on_ground).share[:, 0]
+        return standing_feet(body, frames, 30.0, up, on_ground=on_ground).share[:, 0, 0]
 
     assert not share(nowhere, up, False).any()  # the trunk is lower
     assert share(nowhere, -up, False).all()
@@ -177,7 +177,8 @@ def test_feet_stand_where_they_are_low_and_slow():
 
 
 def motion_frames(pose, translation):
-    return Frames(pose, np.zeros((len(pose), 1), np.float32), translation)
+    shape = np.zeros((len(pose), 1, 1), np.float32)
+    return Frames(pose[:, None], shape, translation[:, None])
 
 
 def test_shape_and_translation_of_each_frame_are_used():
@@ -260,3 +261,115 @@ def test_a_real_motion():
     before, after = skin(body, pose), skin(body, result.pose)
     assert second_differences(after).max() < 1.2 * second_differences(before).max()
     assert np.linalg.norm(after - before, axis=-1).mean() < 0.03
+
+
+def pair_of_people(frames=21, apart=0.35):
+    """Two pairs of tongs side by side: the right arm of one leans into the left one of the other.
+
+    The second one's own arms collide as well, a little later.
+    """
+    pose = np.zeros((frames, 2, 3, 3), np.float32)
+    bump = np.exp(-(((np.arange(frames) - 8) / 2.5) ** 2) / 2)
+    pose[:, 0, 2, 2], pose[:, 1, 1, 2] = -0.3 * bump, 0.3 * bump
+    pose[:, :, :, 0] += 0.02
+    own = 0.5 * np.exp(-(((np.arange(frames) - 14) / 2.0) ** 2) / 2)
+    pose[:, 1, 1, 2] -= own
+    pose[:, 1, 2, 2] += 0.9 * own
+    places = np.zeros((frames, 2, 3), np.float32)
+    places[:, 1, 0] = apart
+    places[:, 1, 1] = 0.01
+    return pose, places
+
+
+def test_two_people_are_freed_together_and_counted_apart():
+    body, (pose, places) = tongs(), pair_of_people()
+    result = untangle_motion(body, pose, translation=places)
+    assert result.pose.shape == pose.shape and np.asarray(result.is_free).all()
+    posed = np.asarray(body(result.pose, translation=jnp.asarray(places)).vertices, np.float64)
+    scene = posed.reshape(len(pose), -1, 3)
+    faces = np.concatenate([np.asarray(body.faces), np.asarray(body.faces) + body.num_vertices])
+    mesh = ipctk.CollisionMesh(scene[0], ipctk.edges(faces), faces)
+    assert not any(ipctk.has_intersections(mesh, np.asfortranarray(v)) for v in scene)
+    within, between = result.within[0], result.between[0]
+    assert (within.intersecting_pairs > 0).any() and (between.intersecting_pairs > 0).any()
+    np.testing.assert_array_equal(
+        within.intersecting_pairs + between.intersecting_pairs, result.before.intersecting_pairs
+    )
+    np.testing.assert_allclose(
+        within.volume + between.volume, result.before.volume, rtol=1e-6, atol=1e-12
+    )
+    alone = untangle_motion(body, pose[:, 1])
+    np.testing.assert_array_equal(within.intersecting_pairs, alone.before.intersecting_pairs)
+    assert not result.within[1].volume.any() and not result.between[1].volume.any()
+    assert json.loads(json.dumps(result.as_dict()))["between_before"]["colliding_frames"] > 0
+    assert alone.between is None and "between_before" not in alone.as_dict()
+    with pytest.raises(ValueError, match="where 2 people are"):
+        untangle_motion(body, pose)
+
+
+def test_one_person_in_a_scene_is_one_person():
+    body, pose = tongs(), snap()[14:27]
+    one, other = untangle_motion(body, pose), untangle_motion(body, pose[:, None])
+    np.testing.assert_array_equal(other.pose[:, 0], one.pose)
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_run_that_was_ended_goes_on_to_the_same_bits(tmp_path, monkeypatch):
+    body = tongs()
+    pose = np.concatenate([snap(frames=31), snap(frames=31, lean=0.6)])
+    whole = untangle_motion(body, pose)
+    windows_seen, calls = [], []
+
+    def stop(step):
+        if step.stage == "freeing":
+            windows_seen.append(step.first)
+            if len(set(windows_seen)) > 1:
+                raise Killed
+
+    with pytest.raises(Killed):
+        untangle_motion(body, pose, resume=tmp_path, on_step=stop)
+    files = sorted(path.name for path in tmp_path.iterdir())
+    assert "before_000000.npz" in files and sum("window" in name for name in files) == 1
+    solve = motion_run.solve
+    monkeypatch.setattr(motion_run, "solve", lambda *a: calls.append(1) or solve(*a))
+    again = untangle_motion(body, pose, resume=tmp_path)
+    assert len(calls) == 1
+    np.testing.assert_array_equal(again.pose, whole.pose)
+    np.testing.assert_array_equal(again.after.volume, whole.after.volume)
+    assert again.rounds == whole.rounds
+    kept = next(path for path in tmp_path.iterdir() if "window" in path.name)
+    kept.write_bytes(kept.read_bytes()[:50])  # damaged: made again
+    third = untangle_motion(body, pose, resume=tmp_path)
+    np.testing.assert_array_equal(third.pose, whole.pose)
+    assert len(calls) == 2
+    with pytest.raises(ValueError, match="other options"):
+        untangle_motion(body, pose, resume=tmp_path, margin=0.003)
+
+
+def test_wanted_contact_is_kept():
+    """The tips of the two arms touch all the while; freeing the arms alone pulls them apart."""
+    body, pose = tongs(), snap()
+    start = skin(body, pose)
+    hit = np.flatnonzero(~untangle_motion(body, pose).before.is_free)
+    arms = [np.flatnonzero(np.asarray(body.weights)[:, k] > 0.5) for k in (1, 2)]
+    frame = hit[0] - 1
+    gap = np.linalg.norm(start[frame][arms[0]][:, None] - start[frame][arms[1]], axis=-1)
+    a, b = np.unravel_index(gap.argmin(), gap.shape)
+    contact = np.array([[arms[0][a], arms[1][b]]])
+    found = []
+    for weight in (0.0, 300.0):
+        result = untangle_motion(
+            body, pose, feet=0.0, contacts=contact, contact_distance=0.08, contact_weight=weight
+        )
+        after = skin(body, result.pose)
+        change = [v[frame, contact[0, 0]] - v[frame, contact[0, 1]] for v in (start, after)]
+        found.append(np.linalg.norm(change[1] - change[0]))
+    assert found[1] < 0.5 * found[0]
+    for wrong in ([[0, 10**6]], [0, 1]):
+        with pytest.raises(ValueError, match="contacts must be pairs"):
+            untangle_motion(body, pose, contacts=np.array(wrong))
+    with pytest.raises(TypeError, match="whole numbers"):
+        untangle_motion(body, pose, contacts=np.array([[0.0, 1.0]]))
