@@ -60,3 +60,27 @@ def skin(body, pose):
 def second_differences(vertices):
     """Of every frame but the first and the last, the largest of a vertex."""
     return np.linalg.norm(np.diff(vertices, n=2, axis=0), axis=-1).max(axis=1)
+
+
+@functools.cache
+def smpl_tongs():
+    """The same with the joints of SMPL, of which two move skin: an ankle and a wrist."""
+    from spt_jax.body.poses import SMPL_LAYOUTS
+
+    body, names = tongs(), SMPL_LAYOUTS[22]
+    at = np.array([0, names.index("left_ankle"), names.index("right_wrist")])
+    weights = np.zeros((body.num_vertices, 22), np.float32)
+    weights[:, at] = body.weights
+    joints = np.zeros((22, 3), np.float32)
+    joints[at] = body.joint_template
+    joints[names.index("head")] = [0.0, 1.0, 0.0]
+    return BodyModel(
+        template=body.template,
+        shape_basis=body.shape_basis,
+        joint_template=jnp.asarray(joints),
+        joint_shape_basis=jnp.zeros((22, 3, 1)),
+        weights=jnp.asarray(weights),
+        faces=body.faces,
+        parents=(-1, *[0] * 21),
+        joint_names=names,
+    )

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -14,7 +14,14 @@ from spt_jax.io.pose_files import MotionFile, Track, choose, open_poses, write_p
 
 if TYPE_CHECKING:
     from spt_jax.body import BodyModel
-    from spt_jax.cli.frames import Frame
+
+
+class HasPose(Protocol):
+    """What was done of a frame."""
+
+    @property
+    def pose(self) -> Any:
+        """Axis-angle of each joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +176,7 @@ def _shapes(asked: Chosen, model: "BodyModel", body: str, notes: list[str]) -> n
 
 
 def write_motions(
-    folder: Path, done: Sequence["Frame"], motion: Motion, asked: Chosen
+    folder: Path, done: Sequence[HasPose], motion: Motion, asked: Chosen
 ) -> list[str]:
     """Write the untangled poses in AMASS' layout, a file a person; return the files' names.
 
@@ -197,7 +204,7 @@ def write_motions(
 
 
 def write_like_input(
-    folder: Path, done: Sequence["Frame"], motion: Motion, asked: Chosen, joints: Sequence[str]
+    folder: Path, done: Sequence[HasPose], motion: Motion, asked: Chosen, joints: Sequence[str]
 ) -> tuple[str, tuple[str, ...]]:
     """Write the input once more with the untangled poses; its name, and what does not fit them.
 

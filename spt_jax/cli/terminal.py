@@ -6,7 +6,17 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 # state(text) says what is being done now; state(text, done=n) also how many items are finished.
 State = Callable[..., None]
@@ -64,6 +74,15 @@ def err_console(quiet: bool = False) -> Console:
     return Console(stderr=True, quiet=quiet, highlight=False)
 
 
+class SpeedColumn(ProgressColumn):
+    """How many items are done a second, over the last ones."""
+
+    def render(self, task: Task) -> Text:
+        """The speed, or nothing as long as none is known."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f}/s", style="progress.data.speed")
+
+
 @contextmanager
 def progress_bar(total: int, quiet: bool = False) -> Iterator[State]:
     """A bar on the standard error stream or in a notebook, gone when done; else nothing.
@@ -80,6 +99,8 @@ def progress_bar(total: int, quiet: bool = False) -> Iterator[State]:
         SpinnerColumn(),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
+        SpeedColumn(),
+        TimeRemainingColumn(compact=True),
         TextColumn("{task.description}", markup=False),
     )
     # rich draws in notebooks by ipywidgets, and warns at every refresh where there are none.
@@ -88,7 +109,7 @@ def progress_bar(total: int, quiet: bool = False) -> Iterator[State]:
     with Progress(*columns, console=console, transient=True, disable=disable) as progress:
         task = progress.add_task("starting", total=total)
 
-        def state(text: str, done: int | None = None) -> None:
+        def state(text: str, done: float | None = None) -> None:
             progress.update(task, description=text, completed=done)
 
         yield state

@@ -30,13 +30,19 @@ def untangle(
     meshes: bool = False,
     like_input: bool = False,
     together: bool = False,
+    frame_by_frame: bool = False,
+    fps: float | None = None,
+    up: str = "auto",
     rays: int | None = None,
     anew: bool = False,
     max_bytes: int | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Free the poses of a pose file from self-intersections, frame by frame, or one mesh file.
+    """Free the motions of a pose file from self-intersections, or single poses, or one mesh file.
+
+    Frames that follow each other are a motion: it is freed as a whole and stays as smooth as it
+    was. What is done of it is kept, so that a run that was ended goes on there.
 
     Takes the pose files of AMASS, SMPLify-X, PROX, HMR2, PHALP, WHAM, VIBE, PyMAF, GVHMR, TRAM,
     ROMP, BEV, SLAHMR, BEDLAM, AIST++, 3DPW, MOYO, EasyMocap, MMHuman3D, Motion-X and VPoser, BVH,
@@ -66,10 +72,16 @@ def untangle(
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
             0.04 on fingers.
-        meshes: write a .glb of each frame before and after, colored by label.
+        meshes: write a .glb of each frame before and after, colored by label; of a motion one
+            that plays before and after side by side.
         like_input: write NAME_untangled too, the input in its own structure with the new poses.
-        together: the people of a file as one scene a frame: freed of themselves and of each other,
-            which also moves them as a whole; what is between and within them is counted apart.
+        together: the people of a file as one scene: freed of themselves and of each other; what is
+            between and within them is counted apart. Frame by frame, people are moved as a whole,
+            too; in a motion they stay where they are.
+        frame_by_frame: free each frame by itself, as single poses are.
+        fps: frames a second; not given: those of the file, or 30.
+        up: the axis that is up, by which standing feet are told: x, y, z, -x, -y, -z; "auto": the
+            one along which heads are above hips.
         rays: how many rays to cast along the longer side of each of three beams; the search uses
             half as many; not given: none, everything is measured exactly.
         anew: throw away what is done of an unfinished run in the folder.
@@ -84,7 +96,15 @@ def untangle(
         rigged = is_rig_file(poses, max_bytes=max_bytes)
     if rigged:
         with user_errors():
-            _refuse("a rig", like_input=like_input, together=together, body=body != "anny")
+            _refuse(
+                "a rig",
+                like_input=like_input,
+                together=together,
+                body=body != "anny",
+                frame_by_frame=frame_by_frame,
+                fps=fps is not None,
+                up=up != "auto",
+            )
         return untangle_rig_file(
             poses,
             out,
@@ -113,6 +133,9 @@ def untangle(
                 body=body != "anny",
                 folds=folds != "ignore",
                 fold_distance=fold_distance is not None,
+                frame_by_frame=frame_by_frame,
+                fps=fps is not None,
+                up=up != "auto",
                 anew=anew,
             )
         return untangle_mesh_file(
@@ -120,6 +143,7 @@ def untangle(
         )
     from spt_jax._exclusions import as_fold_distance
     from spt_jax._query import as_rays
+    from spt_jax.cli.motion_frames import as_motions, pieces_of
     from spt_jax.cli.motions import chosen, motion_of, write_like_input, write_motions
     from spt_jax.cli.together import untangle_together
     from spt_jax.files.outputs import ensure_folder, write_json
@@ -134,7 +158,11 @@ def untangle(
                 "leave one of them out."
             )
         folder = ensure_folder(out)
-    if together:
+    pieces = pieces_of(asked, together=together)
+    whole, note = as_motions(pieces, frame_by_frame=frame_by_frame, folds=folds, rays=rays)
+    if note is not None:
+        show(err_console(quiet), f"note: {note}", "yellow")
+    if together and not (whole and len(pieces[0].rows) > 1):
         return untangle_together(
             asked,
             body,
@@ -158,6 +186,7 @@ def untangle(
             untangle_frames,
             write_meshes,
         )
+        from spt_jax.cli.motion_command import MotionOptions, untangle_as_motions
         from spt_jax.cli.unfinished import UnfinishedRun, manifest_of
 
         said: list[str] = []
@@ -167,6 +196,11 @@ def untangle(
         notes = said + notes
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
+        if whole:
+            wanted = MotionOptions(fold_distance, fps, up, meshes, like_input, anew, json, quiet)
+            return untangle_as_motions(
+                model, motion, asked, pieces, folder, notes, wanted, state, body
+            )
         options = {
             "rays": rays,
             "directions": 3,

@@ -74,7 +74,9 @@ def feet_of(body: AbstractBody) -> Bool[np.ndarray, "K V"]:
         if name in body.joint_names:
             own = [body.joint_names.index(name)]
             own += [j for j, p in enumerate(body.parents) if _is_below(body.parents, p, own[0])]
-            found.append(np.asarray(body.weights)[:, own].sum(axis=1) > 0.5)
+            foot = np.asarray(body.weights)[:, own].sum(axis=1) > 0.5
+            if foot.any():
+                found.append(foot)
     return np.array(found, bool).reshape(-1, body.num_vertices)
 
 

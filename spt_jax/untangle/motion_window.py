@@ -35,7 +35,11 @@ _HELD, _TIGHTER, _LOOSER = 1.0, 4.0, 0.25
 
 # A frame moved by less than this since it was measured, in cm (rms), is not measured again; and one
 # that was never seen to collide, which all that is moved is looked at for in the end.
-_MOVED, _CALM = 0.003, 0.1
+_MOVED, _CALM = 0.01, 0.1
+
+# With so much overlap left in cm^3, the margin's own among it, a frame is not looked at: it
+# collides.
+_MUCH = 20.0
 
 # A correction below this, in cm (rms), is none.
 _NOTHING = 1e-6
@@ -230,9 +234,10 @@ class _Search:
 
     def look(self, vectors) -> Bool[np.ndarray, "T"]:
         """Which frames are free; those that are not weigh more from now on."""
-        found = self._overlap(vectors, np.flatnonzero(self._value > 0))
-        free = self._is_free(found)
-        free[self._value == 0] = True
+        doubtful = (self._value > 0) & (self._value <= _MUCH)
+        free = self._value == 0
+        found = self._overlap(vectors, np.flatnonzero(doubtful))
+        free[doubtful] = self._is_free(found)[doubtful]
         self._press(~free)
         return free
 

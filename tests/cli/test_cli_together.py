@@ -37,6 +37,7 @@ def pair(tmp_path_factory):
 @pytest.mark.slow
 def test_between_and_within_are_counted_apart(balls, pair, tmp_path, capsys):
     asked = ["untangle", str(pair), "--together", "--body", str(balls), "--out", str(tmp_path)]
+    asked += ["--frame-by-frame"]
     assert cli.main([*asked, "--json", "--quiet"]) == 0
     report = json.loads(capsys.readouterr().out)
     apart, crossed, bent = report["frames"]

