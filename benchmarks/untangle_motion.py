@@ -1,7 +1,8 @@
 """Motions freed as a whole, frame by frame, and smoothed: `python -m benchmarks.untangle_motion`.
 
-Each motion at its own rate and interpolated to four times that, as splines of rotations. Whether a
-frame is free is ipctk's to say (`oracles.py`), of 30 frames a second; how smooth a motion is, is
+Each motion at its own rate and interpolated to four times that, as splines of rotations; sequences
+with other shapes made from them; and scenes of two people. Whether a frame is free is ipctk's to
+say (`oracles.py`), of 30 frames a second, in scenes the package's own; how smooth a motion is, is
 told by the second differences of its skin's vertices.
 """
 
@@ -32,6 +33,8 @@ from spt_jax.untangle.feet import standing_feet
 RATE = 30
 # Of the Gaussian over the correction, in seconds.
 SMOOTHED = 0.05
+# At four times the rate, of the subset.
+SUBSET = ("run", "backflip", "walk")
 METHODS = ("as a whole", "frame by frame", "frame by frame, smoothed")
 
 
@@ -43,6 +46,12 @@ class Settings:
     """By name; none: all eleven."""
     finer: tuple[int, ...] = (1, 4)
     """How many times as many frames a second."""
+    shapes: int = 20
+    """How many sequences with shapes of up to two standard deviations either way."""
+    scenes: int = 3
+    """How many scenes of two people."""
+    subset: bool = False
+    """In place of all that: what takes a quarter of an hour on two idle cores."""
     processes: int = 2
     """Each on one core, with motions of its own."""
     kept: Path | None = None
@@ -70,11 +79,27 @@ class Freed(NamedTuple):
     seconds: float
 
 
+class Task(NamedTuple):
+    """What is freed: a motion at so many times its rate, with the mean shape or another one."""
+
+    name: str
+    finer: int
+    seed: int | None
+    kept: Path | None
+
+    @property
+    def path(self) -> Path | None:
+        """Where it is kept."""
+        shape = "" if self.seed is None else f"_shape{self.seed}"
+        return None if self.kept is None else self.kept / f"{self.name}_{self.finer}{shape}.pkl"
+
+
 class Done(NamedTuple):
     """One motion at one rate, and what became of it."""
 
     name: str
     rate: int
+    seed: int | None
     colliding: np.ndarray
     largest: np.ndarray
     rejected: tuple[bool, bool]
@@ -109,48 +134,115 @@ def motion(name: str, finer: int) -> np.ndarray:
     return found.astype(np.float32)
 
 
-def freed(task: tuple[str, int, Path | None]) -> Done:
+def shape_of(seed: int | None) -> np.ndarray:
+    """A body's shape: the mean one, or components drawn from two standard deviations either way."""
+    count = _world()[0].num_shape
+    if seed is None:
+        return np.zeros(count, np.float32)
+    return np.random.default_rng(seed).uniform(-2, 2, count).astype(np.float32)
+
+
+def freed(task: Task) -> Done:
     """One motion in all three ways."""
-    name, finer, kept = task
-    path = None if kept is None else kept / f"{name}_{finer}.pkl"
-    if path is not None and path.exists():
-        return pickle.loads(path.read_bytes())
+    if task.path is not None and task.path.exists():
+        return pickle.loads(task.path.read_bytes())
+    name, finer = task.name, task.finer
     body, _, _ = _world()
-    given, rate = motion(name, finer), RATE * finer
+    given, rate, shape = motion(name, finer), RATE * finer, shape_of(task.seed)
     start = time.process_time()
-    whole = untangle_motion(body, given, frames_per_second=rate)
+    whole = untangle_motion(body, given, shape=shape, frames_per_second=rate)
     middle = time.process_time()
-    single = np.array(untangle_pose(body, jnp.asarray(given)).pose)
+    single = np.array(untangle_pose(body, jnp.asarray(given), shape=jnp.asarray(shape)).pose)
     end = time.process_time()
     found = {
         METHODS[0]: (np.asarray(whole.pose), middle - start),
         METHODS[1]: (single, end - middle),
         METHODS[2]: (_smoothed(given, single, SMOOTHED * rate), end - middle),
     }
-    vertices = _vertices(given)
+    vertices = _vertices(given, shape)
     standing = standing_feet(
-        body, _frames(given), float(rate), np.array([0.0, 1.0, 0.0]), on_ground=False
+        body, _frames(given, shape), float(rate), np.array([0.0, 1.0, 0.0]), on_ground=False
     )
     judged = np.arange(finer // 2, len(given), finer)
     before = _far(vertices[judged])
     done = Done(
         name,
         rate,
+        task.seed,
         ~whole.before.is_free,
         _largest(vertices),
         (whole.before.is_rejected, whole.after.is_rejected),
         {
-            way: _judged(given, *one, vertices, standing, judged, before)
+            way: _judged(given, *one, shape, vertices, standing, judged, before)
             for way, one in found.items()
         },
+    )
+    if task.path is not None:
+        task.path.write_bytes(pickle.dumps(done))
+    return done
+
+
+class Scene(NamedTuple):
+    """Two people, and what became of them; lengths in metres."""
+
+    names: tuple[str, str]
+    frames: int
+    within: tuple[int, int]
+    between: tuple[int, int]
+    left: int
+    ratio: tuple[float, float]
+    moved: float
+    seconds: float
+
+
+# Motions that are there at the same time, and how far the second person stands to the side.
+SCENES = (("walk", "run", 0.35), ("spinkick", "jump", 0.45), ("punch", "dance_a", 0.4))
+
+
+def scene(task: tuple[int, Path | None]) -> Scene:
+    """One scene of two people, of the first second and a half."""
+    number, kept = task
+    path = None if kept is None else kept / f"scene_{number}.pkl"
+    if path is not None and path.exists():
+        return pickle.loads(path.read_bytes())
+    body, _, _ = _world()
+    first, second, apart = SCENES[number]
+    both = [motion(name, 1)[:45] for name in (first, second)]
+    count = min(map(len, both))
+    pose = np.stack([one[:count] for one in both], axis=1)
+    places = np.zeros((count, 2, 3), np.float32)
+    places[:, 1, 0] = apart
+    start = time.process_time()
+    found = untangle_motion(body, pose, translation=places)
+    seconds = time.process_time() - start
+    frames = Frames(pose, np.zeros((count, 2, body.num_shape), np.float32), places)
+    before, after = (
+        _posed(frames._replace(pose=np.asarray(poses))) for poses in (pose, found.pose)
+    )
+    hit = ~found.before.is_free
+    largest = _largest(before), _largest(after)
+    done = Scene(
+        (first, second),
+        count,
+        *(
+            tuple(int((~overlap.is_free).sum()) for overlap in both)
+            for both in (found.within, found.between)
+        ),
+        int((~np.asarray(found.is_free)).sum()),
+        (
+            largest[1].max() / largest[0].max(),
+            np.quantile(largest[1], 0.95) / np.quantile(largest[0], 0.95),
+        ),
+        float(np.linalg.norm(after - before, axis=-1).mean(axis=1)[hit].mean()) if hit.any() else 0,
+        seconds,
     )
     if path is not None:
         path.write_bytes(pickle.dumps(done))
     return done
 
 
-def _judged(given, pose: np.ndarray, seconds, vertices, standing, judged, before) -> Freed:
-    after = _vertices(pose)
+def _judged(given, pose: np.ndarray, seconds, shape, vertices, standing, judged, before) -> Freed:
+    after = _vertices(pose, shape)
     free = before == 0
     changed = np.any(pose != given, axis=(1, 2))[judged]
     free[changed] = _far(after[judged][changed]) == 0
@@ -183,19 +275,21 @@ def _smoothed(given, pose, sigma: float) -> np.ndarray:
     return np.where(np.any(smooth != 0, axis=(1, 2), keepdims=True), found, given)
 
 
-def _frames(pose) -> Frames:
-    body = _world()[0]
+def _frames(pose, shape) -> Frames:
     return Frames(
         pose[:, None],
-        np.zeros((len(pose), 1, body.num_shape), np.float32),
+        np.tile(shape, (len(pose), 1, 1)),
         np.zeros((len(pose), 1, 3), np.float32),
     )
 
 
-def _vertices(pose) -> np.ndarray:
+def _vertices(pose, shape) -> np.ndarray:
+    return _posed(_frames(pose, shape))
+
+
+def _posed(frames: Frames) -> np.ndarray:
     body = _world()[0]
-    parts = [np.asarray(posed(body, b))[:n] for n, b in _frames(pose).batches()]
-    return np.concatenate(parts)
+    return np.concatenate([np.asarray(posed(body, b))[:n] for n, b in frames.batches()])
 
 
 def _largest(vertices) -> np.ndarray:
@@ -206,9 +300,42 @@ def tables(runs: list[Done]) -> list[Table]:
     """Each rate's motions: summed up by way, and one by one."""
     found = []
     for rate in sorted({run.rate for run in runs}):
-        these = [run for run in runs if run.rate == rate]
-        found += [_summary(rate, these), _each(rate, these)]
+        these = [run for run in runs if run.rate == rate and run.seed is None]
+        found += [_summary(f"{len(these)} motions", rate, these), _each(rate, these)]
+    shaped = [run for run in runs if run.seed is not None]
+    if shaped:
+        found.append(_summary(f"{len(shaped)} sequences with other shapes", RATE, shaped))
     return found
+
+
+def _scenes(scenes: list[Scene]) -> Table:
+    rows = [
+        (
+            " beside ".join(one.names),
+            str(one.frames),
+            f"{one.within[0]}, {one.within[1]}",
+            f"{one.between[0]}, {one.between[1]}",
+            f"{one.frames - one.left}",
+            f"{one.ratio[0]:.2f}, {one.ratio[1]:.2f}",
+            f"{1e3 * one.moved:.1f}",
+            f"{2 * one.frames / one.seconds:.1f}",
+        )
+        for one in scenes
+    ]
+    return Table(
+        "Two people as one scene, freed together",
+        (
+            "people",
+            "frames",
+            "collide within people, before and after",
+            "between people",
+            "free afterwards",
+            "second difference, after / before: largest, 95 % quantile",
+            "mean displacement of colliding frames, mm",
+            "frames a second on two cores",
+        ),
+        rows,
+    )
 
 
 def _ratios(run: Done, way: str) -> tuple[float, float]:
@@ -218,7 +345,7 @@ def _ratios(run: Done, way: str) -> tuple[float, float]:
     )
 
 
-def _summary(rate: int, runs: list[Done]) -> Table:
+def _summary(what: str, rate: int, runs: list[Done]) -> Table:
     frames = sum(len(run.colliding) for run in runs)
     touched = [run for run in runs if run.colliding.any()]
     rows = []
@@ -244,7 +371,7 @@ def _summary(rate: int, runs: list[Done]) -> Table:
         )
     rejected = [sum(run.rejected[k] for run in runs) for k in (0, 1)]
     return Table(
-        f"{len(runs)} motions at {rate} frames a second, {frames} frames, "
+        f"{what} at {rate} frames a second, {frames} frames, "
         f"{sum(int(run.colliding.sum()) for run in runs)} collide; the public rule leaves out "
         f"{rejected[0]} of the motions before and {rejected[1]} after being freed as a whole",
         (
@@ -301,8 +428,14 @@ def main(settings: Settings) -> None:
     names = settings.motions or tuple(sorted(lengths, key=lambda name: lengths[name]))
     if settings.kept is not None:
         settings.kept.mkdir(parents=True, exist_ok=True)
-    tasks = [(name, finer, settings.kept) for finer in settings.finer for name in names]
-    runs = []
+    tasks = [Task(name, finer, None, settings.kept) for finer in settings.finer for name in names]
+    shapes, scenes = settings.shapes, list(range(min(settings.scenes, len(SCENES))))
+    if settings.subset:
+        tasks = [Task(name, 1, None, settings.kept) for name in names]
+        tasks += [Task(name, 4, None, settings.kept) for name in names if name in SUBSET]
+        shapes, scenes = 4, [0]
+    tasks += [Task(names[seed % len(names)], 1, seed, settings.kept) for seed in range(shapes)]
+    runs, found = [], []
     # Forked processes would inherit JAX's threads without the threads.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(settings.processes, mp_context=context) as pool, progress() as bar:
@@ -310,15 +443,21 @@ def main(settings: Settings) -> None:
         for run in pool.map(freed, tasks):
             runs.append(run)
             bar.advance(shown)
+        found = list(pool.map(scene, [(number, settings.kept) for number in scenes]))
     parts = tables(runs)
+    if found:
+        parts.append(_scenes(found))
     for table in parts:
         table.print()
     if settings.record:
         chosen = "".join(f" --motions {' '.join(settings.motions)}" if settings.motions else "")
-        command = (
-            f"python -m benchmarks.untangle_motion{chosen} --finer "
-            f"{' '.join(map(str, settings.finer))} --record"
+        how = (
+            "--subset"
+            if settings.subset
+            else f"--finer {' '.join(map(str, settings.finer))} --shapes {settings.shapes} "
+            f"--scenes {settings.scenes}"
         )
+        command = f"python -m benchmarks.untangle_motion{chosen} {how} --record"
         record_section("untangle_motion", "Untangling motions", _text(command, parts))
 
 

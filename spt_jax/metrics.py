@@ -1,20 +1,32 @@
-"""What papers and public filters report of motions: per frame, and of the whole."""
+"""What papers and public filters report: of motions per frame and of the whole, between meshes."""
 
+import csv
+import os
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from spt_jax._between_meshes import BetweenMeshes as BetweenMeshes
+from spt_jax._between_meshes import between_meshes as between_meshes
 from spt_jax._exclusions import as_exclusions
 from spt_jax._query import as_mesh
 from spt_jax._result import Result, plain
 from spt_jax.bridge.on_host import Work, measured
+from spt_jax.files.outputs import atomic_write
 from spt_jax.overlap.depth import penetration_depths
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.measure import Sampling, Unmeasurable, measure
 from spt_jax.rest.surface import RestSurface
 
-__all__ = ["MotionOverlap", "motion_overlap", "rejected"]
+__all__ = [
+    "BetweenMeshes",
+    "MotionOverlap",
+    "between_meshes",
+    "motion_overlap",
+    "rejected",
+    "write_csv",
+]
 
 # The rule by which ProtoMotions leaves motions out: one frame this deep, or more than so many this
 # deep, in metres.
@@ -180,6 +192,45 @@ def motion_overlap(
     exclusions = as_exclusions(face_groups, ignore_groups, rest_surface, triangles)
     # As they are given: without 64 bits JAX would round them.
     return measured_frames(np.asarray(vertices), np.asarray(triangles), exclusions)
+
+
+def write_csv(
+    path: str | os.PathLike[str], overlap: MotionOverlap, frames_per_second: float | None = None
+) -> None:
+    """Write the figures of each frame as a table that spreadsheets and pandas read.
+
+    Args:
+        path: of the file, which appears whole or not at all.
+        overlap: the figures.
+        frames_per_second: with it there is a column of the time, in seconds.
+
+    Raises:
+        OSError: it cannot be written.
+        ValueError: a rate that is not positive.
+
+    Example:
+        >>> import numpy as np, pathlib, tempfile
+        >>> from spt_jax.metrics import MotionOverlap, write_csv
+        >>> deep = np.array([0.0, 0.02])
+        >>> overlap = MotionOverlap(deep**2, deep, np.array([0, 5]), deep, deep / 2)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_csv(pathlib.Path(folder) / "motion.csv", overlap)
+        ...     print((pathlib.Path(folder) / "motion.csv").read_text())
+        frame,is_free,volume,ratio,intersecting_pairs,largest_depth,mean_depth
+        0,True,0.0,0.0,0,0.0,0.0
+        1,False,0.0004,0.02,5,0.02,0.01
+        <BLANKLINE>
+    """
+    if frames_per_second is not None and not 0 < frames_per_second < np.inf:
+        raise ValueError(f"frames_per_second must be positive: got {frames_per_second!r}.")
+    columns: dict[str, list[Any]] = {"frame": list(range(len(overlap.volume)))}
+    if frames_per_second is not None:
+        columns["time"] = [frame / frames_per_second for frame in columns["frame"]]
+    columns |= overlap.as_dict()["per_frame"]
+    with atomic_write(path) as temporary, open(temporary, "w", newline="") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(columns)
+        table.writerows(zip(*columns.values(), strict=True))
 
 
 class _Options(NamedTuple):

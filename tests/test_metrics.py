@@ -1,14 +1,22 @@
 """Figures of motions: depths with known answers, and the rule of public filters."""
 
+import csv
 import json
 
 import igl
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
 from helpers import box, sphere
 
-from spt_jax.metrics import MotionOverlap, motion_overlap, rejected
+from spt_jax.metrics import (
+    MotionOverlap,
+    between_meshes,
+    motion_overlap,
+    rejected,
+    write_csv,
+)
 from spt_jax.overlap.depth import penetration_depths
 from spt_jax.rest.surface import RestSurface
 
@@ -104,3 +112,62 @@ def test_what_cannot_be_measured_is_named(untyped):
         motion_overlap(moving, faces)
     with pytest.raises(ValueError, match="frames, V, 3"):
         motion_overlap(vertices, faces)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_between_meshes_against_an_exact_boolean(rng, dtype):
+    first = trimesh.creation.icosphere(subdivisions=2)
+    second = trimesh.creation.capsule(height=1.0, radius=0.4, count=[12, 12])
+    second.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
+    second.apply_translation([0.8, 0.2, -0.1])
+    arrays = [(m.vertices.astype(dtype), np.array(m.faces)) for m in (first, second)]
+    found = between_meshes(*arrays[0], *arrays[1], contact_distance=0.05)
+    solids = [
+        manifold3d.Manifold(manifold3d.Mesh64(v.astype(np.float64), f.astype(np.uint64)))
+        for v, f in arrays
+    ]
+    assert found.volume == pytest.approx((solids[0] ^ solids[1]).volume(), rel=1e-9)
+    back = between_meshes(*arrays[1], *arrays[0])
+    assert back.volume == pytest.approx(found.volume, rel=1e-9)
+    assert back.largest_depth == found.largest_depth > 0
+    np.testing.assert_array_equal(back.depth, found.other_depth)
+    vertices, faces = arrays[0][0].astype(np.float64), arrays[1][1]
+    signed = igl.signed_distance(vertices, arrays[1][0].astype(np.float64), faces)[0]
+    np.testing.assert_allclose(found.depth, np.maximum(-signed, 0), atol=1e-6)
+    assert found.contact_ratio == pytest.approx(np.mean(signed <= 0.05))
+    assert found.mean_depth == pytest.approx(-signed[signed < 0].mean(), rel=1e-5)
+
+
+def test_meshes_apart_and_one_in_the_other():
+    box_vertices, faces = box()
+    ball, ball_faces = sphere(radius=0.3, subdivisions=2)
+    inside = between_meshes(ball, ball_faces, box_vertices, faces)
+    assert inside.intersecting_pairs == 0 < inside.volume and not inside.is_free
+    assert inside.largest_depth == pytest.approx(0.5 - np.abs(ball).max(axis=1).min(), abs=1e-9)
+    assert inside.contact_ratio == 1.0 and not inside.other_depth.any()
+    apart = between_meshes(ball + np.array([0.9, 0, 0]), ball_faces, box_vertices, faces)
+    assert apart.is_free and apart.contact_ratio == 0 and apart.largest_depth == 0
+    near = between_meshes(
+        ball + np.array([0.801, 0, 0]), ball_faces, box_vertices, faces, contact_distance=0.01
+    )
+    assert 0 < near.contact_ratio < 0.1 and near.is_free
+    content = json.loads(json.dumps(inside.as_dict()))
+    assert content["volume_in_cubic_centimeters"] == pytest.approx(1e6 * content["volume"])
+    with pytest.raises(ValueError, match="contact_distance"):
+        between_meshes(ball, ball_faces, box_vertices, faces, contact_distance=-1.0)
+    with pytest.raises(ValueError, match="other_vertices"):
+        between_meshes(ball, ball_faces, box_vertices[None], faces)
+
+
+def test_a_table_of_all_frames(tmp_path):
+    deep = np.array([0.0, 0.02, 1 / 3])
+    overlap = MotionOverlap(deep**2, deep, np.array([0, 5, 7]), deep, deep / 2)
+    write_csv(tmp_path / "m.csv", overlap, 60.0)
+    with open(tmp_path / "m.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row["largest_depth"]) for row in rows] == deep.tolist()
+    assert [row["is_free"] for row in rows] == ["True", "False", "False"]
+    assert [float(row["time"]) for row in rows] == [0.0, 1 / 60, 2 / 60]
+    with pytest.raises(ValueError, match="positive"):
+        write_csv(tmp_path / "no.csv", overlap, 0.0)
+    assert not (tmp_path / "no.csv").exists()

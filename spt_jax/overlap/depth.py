@@ -42,6 +42,13 @@ def penetration_depths(
     return depth, nearest
 
 
+def distances(
+    points: Float[np.ndarray, "N 3"], triangles: Float[np.ndarray, "M 3 3"]
+) -> Float[np.ndarray, "N"]:
+    """From each point to the nearest triangle."""
+    return _nearest(points, triangles)[0] if len(points) else np.zeros(0)
+
+
 def _patches(faces, inside) -> Int[np.ndarray, "V"]:
     """The number of each vertex's patch; -1 of vertices that are not inside."""
     chosen = np.flatnonzero(inside)
