@@ -14,10 +14,10 @@ def clean(
     body: str = "anny",
     structure: Literal["input", "amass"] = "input",
     frame_rate: float = 30.0,
-    fade: float = 0.05,
+    fade: float = 0.02,
     fold_distance: float | None = None,
     margin: float = 0.002,
-    feet: float = 1.0,
+    feet: float = 20.0,
     engine: Literal["local", "ray"] = "local",
     processes: int | Literal["auto"] = "auto",
     shard: str | None = None,
@@ -51,7 +51,7 @@ def clean(
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold; not given: as near as the place allows.
         margin: how far apart colliding parts are pushed, in metres.
-        feet: how strongly feet that stand are held, against the rest of the skin.
+        feet: how strongly feet that stand are held, against the whole skin.
         engine: "local", processes of this machine, or "ray", a Ray cluster.
         processes: how many, each of one core and 1 GB; "auto": as many as there is room for.
         shard: i/n with i from 0: one of n parts of the files alone, for job arrays.

@@ -137,9 +137,9 @@ class CleanMotions(MeasureMotions):
 
     structure: Literal["input", "amass"] = "input"
     frame_rate: float = 30.0
-    fade: float = 0.05
+    fade: float = 0.02
     margin: float = 0.002
-    feet: float = 1.0
+    feet: float = 20.0
     name: str = field(default="clean", init=False)
 
     def settings(self) -> dict[str, Any]:
@@ -261,10 +261,10 @@ def clean(
     body: str = "anny",
     structure: Literal["input", "amass"] = "input",
     frame_rate: float = 30.0,
-    fade: float = 0.05,
+    fade: float = 0.02,
     fold_distance: float | None = None,
     margin: float = 0.002,
-    feet: float = 1.0,
+    feet: float = 20.0,
     max_bytes: int | None = None,
     pictures: int = 10,
     **how: Any,
