@@ -50,15 +50,11 @@ def draw_worst(
         return ""
     known = {item.name: item for item in items}
     try:
-        from spt_jax.show import RenderingUnavailable
-    except ImportError as error:
-        return str(error)
-    try:
         task.prepare()
         ensure_folder(store.folder / "pictures")
         for row in wanted:
             _draw(task, store, known[row["name"]], row)
-    except (ImportError, RenderingUnavailable, ValueError, OSError) as error:
+    except (ImportError, RuntimeError, ValueError, OSError) as error:
         return " ".join(str(error).split())
     return ""
 
