@@ -83,8 +83,8 @@ def voxels(pair: Pair, pitch: float, shift: np.ndarray) -> tuple[float, float, f
     both = np.zeros(len(centers), bool)
     both[inside] = _inside(first, centers[inside])
     grid = inside.reshape(tuple(count))
-    within = distance_transform_edt(grid) * pitch
-    outside = distance_transform_edt(~grid) * pitch
+    within = np.asarray(distance_transform_edt(grid)) * pitch
+    outside = np.asarray(distance_transform_edt(~grid)) * pitch
     cell = np.floor((np.asarray(first.vertices) - low) / pitch).astype(int)
     there = ((cell >= 0) & (cell < count)).all(axis=1)
     at = tuple(cell[there].T)
@@ -97,7 +97,7 @@ def _inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     if not len(points):
         return np.zeros(0, bool)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    return igl.fast_winding_number(vertices, faces, points) > 0.5
+    return np.asarray(igl.fast_winding_number(vertices, faces, points)) > 0.5
 
 
 def table() -> Table:

@@ -199,6 +199,12 @@ class Scene(NamedTuple):
 SCENES = (("walk", "run", 0.35), ("spinkick", "jump", 0.45), ("punch", "dance_a", 0.4))
 
 
+def _left(overlaps) -> tuple[int, int]:
+    """Frames with intersections, before and after."""
+    before, after = (int((~overlap.is_free).sum()) for overlap in overlaps)
+    return before, after
+
+
 def scene(task: tuple[int, Path | None]) -> Scene:
     """One scene of two people, of the first second and a half."""
     number, kept = task
@@ -221,13 +227,12 @@ def scene(task: tuple[int, Path | None]) -> Scene:
     )
     hit = ~found.before.is_free
     largest = _largest(before), _largest(after)
+    assert found.within is not None and found.between is not None  # two people
     done = Scene(
         (first, second),
         count,
-        *(
-            tuple(int((~overlap.is_free).sum()) for overlap in both)
-            for both in (found.within, found.between)
-        ),
+        _left(found.within),
+        _left(found.between),
         int((~np.asarray(found.is_free)).sum()),
         (
             largest[1].max() / largest[0].max(),

@@ -132,7 +132,7 @@ def test_between_meshes_against_an_exact_boolean(rng, dtype):
     assert back.largest_depth == found.largest_depth > 0
     np.testing.assert_array_equal(back.depth, found.other_depth)
     vertices, faces = arrays[0][0].astype(np.float64), arrays[1][1]
-    signed = igl.signed_distance(vertices, arrays[1][0].astype(np.float64), faces)[0]
+    signed = np.asarray(igl.signed_distance(vertices, arrays[1][0].astype(np.float64), faces)[0])
     np.testing.assert_allclose(found.depth, np.maximum(-signed, 0), atol=1e-6)
     assert found.contact_ratio == pytest.approx(np.mean(signed <= 0.05))
     assert found.mean_depth == pytest.approx(-signed[signed < 0].mean(), rel=1e-5)

@@ -65,7 +65,7 @@ def untangle_mesh_file(
             state(f"{path.name}: attempt {step.stage + 1}, step {step.steps}, {pairs}")
 
         # Half the rays, as for poses: the last intersections do not hang on them.
-        sampling = {} if rays is None else {"rays": max(rays // 2, 1)}
+        sampling: dict[str, Any] = {} if rays is None else {"rays": max(rays // 2, 1)}
         with measurable(path.name):
             result = untangle_mesh(given, faces, on_step=on_step, **sampling)
         seconds = time.perf_counter() - start

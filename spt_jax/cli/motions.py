@@ -227,7 +227,7 @@ def write_like_input(
 
 
 def _hands_as_given(
-    name: str, done: Sequence["Frame"], motion: Motion, asked: Chosen, joints: Sequence[str]
+    name: str, done: Sequence[HasPose], motion: Motion, asked: Chosen, joints: Sequence[str]
 ) -> list[str]:
     """What to say of hands that are components in the file and whose fingers were moved."""
     said = []

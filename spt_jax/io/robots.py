@@ -40,7 +40,7 @@ class Robot(eqx.Module):
     _joints: tuple = eqx.field(static=True)
 
     @property
-    def neighbour_pairs(self) -> Pairs:
+    def neighbor_pairs(self) -> Pairs:
         """Each link with itself and with those that a joint connects it with.
 
         They touch or overlap by design; for `ignore_groups`. Links without faces are as if they
@@ -114,7 +114,7 @@ def load_robot(path: str | Path) -> Robot:
         >>> robot = load_robot("panda.urdf")  # doctest: +SKIP
         >>> loss = lambda q: self_intersection_penalty(  # doctest: +SKIP
         ...     robot(q), robot.faces, face_groups=robot.face_groups,
-        ...     ignore_groups=robot.neighbour_pairs)
+        ...     ignore_groups=robot.neighbor_pairs)
     """
     path = Path(path)
     if not path.is_file():
@@ -224,7 +224,8 @@ def _mesh(link: Any, path: Path) -> trimesh.Trimesh:
         elif shape.sphere is not None:
             part = trimesh.creation.icosphere(subdivisions=2, radius=shape.sphere.radius)
         else:
-            part = trimesh.load(_found(shape.mesh.filename, path), force="mesh")
+            part = trimesh.load_mesh(_found(shape.mesh.filename, path))
+            assert isinstance(part, trimesh.Trimesh)  # of a scene, all its meshes in one
             scale = 1.0 if shape.mesh.scale is None else shape.mesh.scale
             part.vertices = part.vertices * np.asarray(scale, np.float64)
         if collision.origin is not None:
@@ -232,7 +233,8 @@ def _mesh(link: Any, path: Path) -> trimesh.Trimesh:
         parts.append(trimesh.Trimesh(part.vertices, part.faces))
     if not parts:
         return trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    return trimesh.util.concatenate(parts)
+    whole: Any = trimesh.util.concatenate(parts)
+    return whole
 
 
 def _found(name: str, path: Path) -> Path:

@@ -78,7 +78,7 @@ def write_film(
             write(temporary, pictures, frames_per_second)
 
 
-def _as_panels(motions, faces, labels) -> list[list[tuple[np.ndarray, ...]]]:
+def _as_panels(motions, faces, labels) -> list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """Of each frame its panels."""
     lengths = [len(motion) for motion in motions]
     if not lengths or len(set(lengths)) != 1 or not lengths[0]:
@@ -110,7 +110,7 @@ def _drawn(panels, size: tuple[int, int], view: View) -> list[UInt8[np.ndarray, 
             canvas = np.full((height, len(row) * (width + GAP) - GAP, 3), 255, np.uint8)
             for j, panel in enumerate(row):
                 x = j * (width + GAP)
-                canvas[:, x : x + width] = draw_panel(plotter, *panel, camera)
+                canvas[:, x : x + width] = draw_panel(plotter, *panel, camera=camera)
             found.append(canvas)
     return found
 

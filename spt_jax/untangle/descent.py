@@ -243,3 +243,9 @@ def _one_step(search: Search, arguments, moved, state):
     body, (pose, shape, translation, factor), _, _ = arguments
     at = turned(body, pose, factor, moved)
     return moved, state, done, result, at, body(at, shape, translation).vertices
+
+
+def is_near(candidate: Any, pose: Any) -> bool:
+    """Whether no joint turns by more than a full turn, as one of a search that ran away does."""
+    turn = np.linalg.norm(np.asarray(candidate) - np.asarray(pose), axis=-1)
+    return float(turn.max()) <= 2 * np.pi

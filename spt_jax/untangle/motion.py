@@ -185,7 +185,9 @@ def untangle_motion(
     made_from += [str(jax.tree.structure(body)), translation is None]
     kept = KeptWindows(resume, made_from)
     run = Run(body, frames, Exclusions(rest=rest), kept, on_step or _nothing)
-    before = run.measured("before", "measuring", np.arange(len(frames.pose)), frames.pose)
+    before = run.measured(
+        "before", "measuring", np.arange(len(frames.pose)), np.asarray(frames.pose)
+    )
     colliding = (before.intersecting_pairs > 0) | (before.volume > asked.tolerance)
     pose, turns, rounds = np.array(frames.pose), None, 0
     if colliding.any():

@@ -25,6 +25,7 @@ from spt_jax.untangle.descent import (
     descend_in_steps,
     displacement_factor,
     faces_of,
+    is_near,
     pose_of,
     vertices_of,
 )
@@ -38,9 +39,6 @@ from spt_jax.untangle.spread import Surface
 _WEIGHTS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 # Below this a weight may be too weak to move anything.
 _STRONG = 10.0
-
-# A pose that turns a joint by more than a full turn, in radians, is no pose near the one given.
-_MOST_TURN = 2 * np.pi
 
 
 class UntangleResult(Result):
@@ -313,8 +311,7 @@ def _untangle_one(
 
 def _measured(search: Search, body, pose, candidate, shape, translation):
     """The vertices and the overlap of a pose, or None where it has run away."""
-    turn = np.linalg.norm(np.asarray(candidate) - np.asarray(pose), axis=-1)
-    if not float(turn.max()) <= _MOST_TURN:  # NaN is not
+    if not is_near(candidate, pose):
         return None
     posed = vertices_of(body, candidate, shape, translation)
     try:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from spt_jax.body.base import AbstractBody
 from spt_jax.overlap.measure import Measurement, Unmeasurable
-from spt_jax.untangle.descent import CENTIMETRE, Search, descend, turned, vertices_of
+from spt_jax.untangle.descent import CENTIMETRE, Search, descend, is_near, turned, vertices_of
 
 # A limb is the largest branch of the skeleton with at most this share of the surface.
 _LARGEST_LIMB = 0.3
@@ -91,7 +91,7 @@ def other_side(
             moved, taken, _ = descend(search, body, fixed, moved, search.margin, weight)
             steps += int(taken)
             at = turned(body, pose, factor, moved)
-            if not np.isfinite(at).all():
+            if not is_near(at, pose):
                 break
             vertices = vertices_of(body, at, shape, translation)
             try:

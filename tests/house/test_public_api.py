@@ -202,7 +202,14 @@ NAMESPACES = {
         "write_poses",
         "write_rig",
     ],
-    "metrics": ["MotionOverlap", "motion_overlap", "rejected"],
+    "metrics": [
+        "BetweenMeshes",
+        "MotionOverlap",
+        "between_meshes",
+        "motion_overlap",
+        "rejected",
+        "write_csv",
+    ],
     "xla": ["Xla", "device_usage"],
 }
 

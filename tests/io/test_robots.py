@@ -66,7 +66,7 @@ def test_links_that_a_joint_connects_do_not_count(robot):
             robot(values),
             robot.faces,
             face_groups=robot.face_groups,
-            ignore_groups=robot.neighbour_pairs,
+            ignore_groups=robot.neighbor_pairs,
         )
 
     assert loss(jnp.zeros(3)) == 0
