@@ -260,9 +260,12 @@ class _Search:
         if len(moved):
             pose[moved] = self._corrections.poses(moved, vectors[moved])
         free = self._is_free(overlap)
-        fresh = ~free & ~self._active
+        # Also one whose skin, moved outwards, does not meet: what meets there may be a fold.
+        fresh = ~free & (~self._active | (self._value == 0))
+        self._margin[fresh & self._active] *= _WIDER
         self._active |= fresh
         self._place[fresh] = np.nan
+        self._least[fresh] = np.inf
         self._anchored.look(vectors)
         cost = self._known.cost(vectors) + self._anchored.ties().cost(vectors)
         return _Candidate(vectors, pose, overlap, free, cost)
@@ -270,10 +273,11 @@ class _Search:
     def _overlap(self, vectors, moved: Int[np.ndarray, "F"]) -> MotionOverlap:
         """The overlap without a margin; of frames that did not move, what it was.
 
-        Nor is it measured where there was none, or near by none with the margin.
+        Nor is it measured where there was none, or, of a frame that never collided, near by none
+        with the margin.
         """
         same = (vectors == self._clear).all(axis=1)
-        kept = self._with_margin & (self._value == 0)
+        kept = self._with_margin & ~self._active
         kept &= np.linalg.norm(vectors - self._place, axis=1) <= _MOVED
         known, wanted = (moved[(same | kept)[moved] == yes] for yes in (True, False))
         nothing = self._before.at(known).without_overlap()

@@ -103,7 +103,7 @@ def test_long_collisions_are_freed_in_pieces_without_a_seam(monkeypatch):
     monkeypatch.setattr(motion_run, "_SHORTEST", 0)
     body, steps = tongs(), []
     pose = snap(frames=60, width=25.0)
-    result = untangle_motion(body, pose, frames_per_second=10.0, on_step=steps.append)
+    result = untangle_motion(body, pose, frames_per_second=20.0, fade=0.05, on_step=steps.append)
     starts = sorted({step.first for step in steps if step.stage == "freeing"})
     assert len(starts) > 1 and {step.frames for step in steps} == {60}
     assert np.asarray(result.is_free).all() and not crosses(body, skin(body, result.pose)).any()
