@@ -90,8 +90,8 @@ def between_meshes(
     """Intersection volume, penetration depth and contact of two closed meshes.
 
     The volume is the exact one of their solids, the integral of the product of their winding
-    numbers. Papers estimate it by voxels, mostly of 5 mm or 1 cm, which is off by tens of per cent
-    for a finger in an object (benchmarks/results.md, "Between meshes"). Depths are measured at the
+    numbers. Papers estimate it by voxels, mostly of 5 mm or 1 cm, which depends on where the grid
+    lies (`benchmarks/between_meshes.py`). Depths are measured at the
     vertices, from each one inside to the nearest place of the other surface.
 
     Args:

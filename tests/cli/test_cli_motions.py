@@ -35,6 +35,7 @@ def motion_file(path, pose, **given):
     return str(path)
 
 
+@pytest.mark.slow
 def test_a_motion_is_freed_as_a_whole(tmp_path, capsys):
     pose = snap()[12:29]
     file, out = motion_file(tmp_path / "m.npz", pose, frame_rate=60.0), tmp_path / "out"
@@ -63,6 +64,7 @@ def test_a_motion_is_freed_as_a_whole(tmp_path, capsys):
     assert report["settings"]["up"] == [0.0, 1.0, 0.0]
 
 
+@pytest.mark.slow
 def test_frame_by_frame_where_that_is_said(tmp_path, capsys, monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("no motion was asked for")

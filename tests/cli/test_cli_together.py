@@ -75,6 +75,7 @@ def test_what_does_not_go_together_is_said(balls, pair, tmp_path, capsys):
     assert "without a translation" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_group_is_its_people_one_after_the_other(balls, rng):
     body = load_body(balls)
     group = BodyGroup(body, 2)

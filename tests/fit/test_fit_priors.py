@@ -20,6 +20,10 @@ def poses(count=6):
     return jnp.asarray(mocap().pose[:: len(mocap().pose) // count][:count, :22])
 
 
+# The mixture takes ten seconds to fit.
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def mixture():
     return mixture_prior(NAMES, 3)
