@@ -46,7 +46,7 @@ def test_a_hand_of_mano_is_a_body(hand):
     assert found_in(hand, hand(fist).vertices).intersecting_pairs > 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fist_through_the_palm_is_freed(hand):
     fist = hand.with_hands(jnp.zeros((16, 3), jnp.float32), left=jnp.ones(1, jnp.float32))
     result = untangle_pose(hand, fist)
@@ -55,7 +55,7 @@ def test_a_fist_through_the_palm_is_freed(hand):
     assert moved.max() < 0.04
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_hands_in_a_scene_are_freed_of_each_other(hand):
     pair, poses = BodyGroup(hand, 2), np.zeros((2, 16, 3), np.float32)
     poses[1, 0] = 0.0, np.pi, 0.0  # fingers towards fingers

@@ -45,7 +45,7 @@ def test_eyes_that_look_about_do_not_collide(body):
     assert found_in(body, body(pose).vertices).is_free
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["cartwheel/0103", "roll/0052", "crawl/0012"])
 def test_frames_are_freed(body, name):
     pose = body.pose_from_smpl(jnp.asarray(mocap().pose[mocap().names.index(name)]))
@@ -54,7 +54,7 @@ def test_frames_are_freed(body, name):
     assert found_in(body, result.vertices).is_free
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fit_ends_without_overlap(body):
     pose = body.pose_from_smpl(jnp.asarray(mocap().pose[mocap().names.index("punch/0013")]))
     regressor = keypoint_regressor(body, "smpl22")

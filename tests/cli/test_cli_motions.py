@@ -80,7 +80,7 @@ def test_frame_by_frame_where_that_is_said(tmp_path, capsys, monkeypatch):
     assert main(["untangle", file, "--out", str(tmp_path / "out"), "--up", "q"]) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_tracks_are_one_scene(tmp_path, capsys):
     pose = np.zeros((9, 2, 3, 3), np.float32)
     bump = np.exp(-(((np.arange(9) - 4) / 1.5) ** 2) / 2)
@@ -114,7 +114,7 @@ def test_two_tracks_are_one_scene(tmp_path, capsys):
     assert not any(one["before"]["colliding_frames"] for one in report["motions"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_that_was_ended_goes_on(tmp_path, capsys, monkeypatch):
     pose = np.concatenate([snap(frames=31), snap(frames=31, lean=0.6)])
     file = motion_file(tmp_path / "m.npz", pose)

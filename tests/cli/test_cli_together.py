@@ -34,7 +34,7 @@ def pair(tmp_path_factory):
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_between_and_within_are_counted_apart(balls, pair, tmp_path, capsys):
     asked = ["untangle", str(pair), "--together", "--body", str(balls), "--out", str(tmp_path)]
     asked += ["--frame-by-frame"]

@@ -87,7 +87,7 @@ def frames_that_collide(path):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_motion_is_free_in_its_own_structure(folder, cleaned):
     out, code = cleaned
     assert code == 1  # a file is cut
@@ -103,7 +103,7 @@ def test_every_motion_is_free_in_its_own_structure(folder, cleaned):
     np.testing.assert_array_equal(np.load(out / "calm.npy"), np.load(folder / "calm.npy"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_manifest_says_what_happened(folder, cleaned):
     out, _ = cleaned
     rows = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
@@ -166,7 +166,7 @@ def test_the_report_of_a_measured_folder(measured):
     assert page.count("<rect") == 2 * 9 and "after" not in page.split("</style>")[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_opens_without_anything_else(cleaned):
     out, _ = cleaned
     page = (out / "report.html").read_text()
@@ -202,7 +202,7 @@ def files_in(folder):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("with_tongs")
 def test_measured_again_nothing_collides(cleaned, measured, tmp_path, capsys):
     words = ["--processes", "0", "--pictures", "0", "--json"]
@@ -216,7 +216,7 @@ def test_measured_again_nothing_collides(cleaned, measured, tmp_path, capsys):
         np.testing.assert_allclose(before[name], figures[f"{name}_before"], rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("with_tongs")
 def test_in_amass_layout_each_person_has_a_file(folder, tmp_path):
     datasets.clean(folder, tmp_path, structure="amass", processes=0, pictures=0)

@@ -280,7 +280,7 @@ def test_killed_at_two_random_moments(tmp_path):
     killed_at_random(tmp_path, 2, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_at_twenty_random_moments(tmp_path):
     killed_at_random(tmp_path, 20, 1)
 
@@ -309,7 +309,7 @@ def _runs(pid):
         return False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ray_cluster_of_two_nodes_one_of_which_is_killed(tmp_path):
     pytest.importorskip("ray")
     folder, out, log = tmp_path / "in", tmp_path / "out", tmp_path / "log"

@@ -50,7 +50,7 @@ def test_what_is_no_motion_is_said(untyped):
         near_pose(prior, prior.mean, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_is_smoother_as_a_motion_than_frame_by_frame():
     body = embedded_body()
     first = mocap().names.index("run/0010")

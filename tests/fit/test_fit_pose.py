@@ -351,7 +351,7 @@ def test_what_a_callback_raises_ends_the_fit(people, plain):
         fit(people[2][0], on_step=stop)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hands_are_fitted_where_their_points_are_given():
     """A fist: without its points the fingers stay as they were."""
     body = embedded_body()

@@ -43,7 +43,7 @@ def test_places_on_other_sides_are_free_and_the_nearest_come_first():
         assert changed.tolist() == [body.joint_names.index("left_shoulder")]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_nearer_on_another_side_is_taken(monkeypatch):
     body, pose = embedded_body(), jnp.asarray(THROUGH)
     monkeypatch.setattr(sides, "_FAR", np.inf)

@@ -128,7 +128,7 @@ def test_frames_and_characters_are_chosen(snake, tmp_path, capsys):
     np.testing.assert_allclose(freed.clip(1).pose, freed.clip(0).pose, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_motion_of_a_rig_is_freed_as_a_whole(snake):
     rig = load_rig(snake, dtype=np.float32)
     clip = rig.clip("curl")
