@@ -81,7 +81,7 @@ def other_side(
         found = search.measure(vertices, before.faces)
         return search.is_free(found), found.vertices
 
-    given = np.asarray(pose, np.float64)
+    given = np.array(pose, np.float64)  # SciPy wants arrays that may be written to
     limbs = limbs_in_collision(before, body.part_groups, body.parents)
     for start in free_starts(given, limbs, look, _MOST_STARTS):
         turn = (start.pose - given)[np.asarray(body.free_rows)].ravel() / CENTIMETRE
