@@ -160,8 +160,8 @@ def check_mesh(
         >>> box = trimesh.creation.box()
         >>> print(check_mesh(box.vertices, box.faces))
         mesh: 8 vertices, 12 faces, 1 component; fit for the penalty
-        >>> print(check_mesh(box.vertices, box.faces[:4]).problems[0].split(",")[0])
-        an open sheet: 1 hole of 6 edges
+        >>> print(check_mesh(box.vertices, box.faces[:4]).problems[0].split(":")[0])
+        an open sheet
     """
     given, triangles = one_mesh(vertices, faces, counting=True)
     points = np.asarray(given, np.float64)
