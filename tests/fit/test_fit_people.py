@@ -63,7 +63,7 @@ def intersecting_pairs_between(body, vertices):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_people_who_embrace_end_apart(body, fitted):
     found, seen, steps = fitted
     assert [step.stage for step in steps] == list(range(len(steps)))

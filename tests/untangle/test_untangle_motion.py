@@ -97,7 +97,7 @@ def test_a_search_that_finds_nothing_changes_nothing(monkeypatch):
     assert not result.moved.any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_long_collisions_are_freed_in_pieces_without_a_seam(monkeypatch):
     monkeypatch.setattr(motion_run, "_LONGEST", 30.0)
     monkeypatch.setattr(motion_run, "_SHORTEST", 0)
@@ -249,7 +249,7 @@ def test_a_search_that_ends_early_keeps_the_best(monkeypatch):
     assert left <= np.count_nonzero(~result.before.is_free)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_real_motion():
     body = embedded_body()
     names = list(mocap().names)
