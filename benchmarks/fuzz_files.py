@@ -25,11 +25,12 @@ import numpy as np
 from benchmarks.fuzz_formats import FORMATS, Arrays, Format, Generator, Written, as_json, as_npz
 from spt_jax.files.limits import TooLargeError
 from spt_jax.files.pickles import RefusedPickleError
+from spt_jax.io.poses.reading import UnknownStructureError
 
 SECONDS = 10  # for a file of some kilobytes
 MEGABYTES = 300  # that reading it may take beyond what the process has
 
-_PLAIN = (ValueError, TooLargeError, RefusedPickleError, OSError)
+_PLAIN = (ValueError, TooLargeError, RefusedPickleError, UnknownStructureError, OSError)
 _STRANGE: tuple[Any, ...] = (
     *(None, True, "x", "", -1, 0, 2**31, 2**63, 10**400, 1e308, -1e308),
     *(math.nan, math.inf, [], {}, [[]], [None], {"keypoints": None}, "9" * 5000),

@@ -92,9 +92,18 @@ class ExactOverlap:
         share[np.bincount(at, minlength=count) == 0] = 1.0
         return Judged(layer, region, at, volume, total, share)
 
-    @cached_property
+    @property
     def volume(self) -> float:
         """The overlap volume that counts."""
+        return max(self.signed_volume, 0.0)
+
+    @cached_property
+    def signed_volume(self) -> float:
+        """The sums that the volume is made of.
+
+        They fall below zero by rounding, or where a part that a fan turned inside out (w = -1) is
+        left out as a fold and another part overlaps it: then only the product of the two is left.
+        """
         surface, shares, total = self.surface, self._whole.shares, 0.0
         if len(shares.faces):
             together = np.zeros(len(shares.faces), np.int64)
@@ -102,7 +111,7 @@ class ExactOverlap:
             total = float(volumes_of(surface.points, faces, shares, together, 1, times)[0])
         if self.judged is not None:
             total += float(self.judged.volume @ self.judged.share)
-        return max(total, 0.0) / surface.scale**3
+        return total / surface.scale**3
 
     def gradient(self) -> Float[np.ndarray, "V 3"]:
         """The derivative of the volume, at the vertices given."""

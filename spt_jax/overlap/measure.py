@@ -226,7 +226,9 @@ class Measurement:
             label = self.labels(rule)
             return vertex_gradient(self.vertices, self.faces, label, unit=kind == "unit")
         if self.exact:
-            return self.overlap.gradient()
+            # What the volume is where its sums are below zero: constant.
+            below = self.overlap.signed_volume < 0
+            return np.zeros(self.vertices.shape) if below else self.overlap.gradient()
         vertices, faces, _ = self.closed
         total = np.zeros(vertices.shape)
         directions = np.array([found.beam.direction for found in self.beams])
