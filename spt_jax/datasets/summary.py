@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from spt_jax.datasets.items.inventory import Inventory
@@ -79,21 +80,23 @@ def write_results(
     why_not = "the run was ended"
     if drawing is not None and draw:  # which takes seconds, before others are kept waiting
         why_not = drawing(store, found, _rows(store, found))
-    with store.whole():
+    store.sweep()
+    with store.writing() as within:
         rows = _rows(store, found)
         summary = summarized(task.name, found, rows, seconds, kept)
-        _write(store, "manifest.jsonl", "".join(f"{json.dumps(row)}\n" for row in rows))
-        _write(store, "manifest.csv", as_csv(rows))
+        lines = "".join(f"{json.dumps(row)}\n" for row in rows)
+        _write(store.out / "manifest.jsonl", lines, within)
+        _write(store.out / "manifest.csv", as_csv(rows), within)
         people = [
             {"name": row["name"], **person} for row in rows for person in row.get("people", ())
         ]
         if people:
-            _write(store, "people.csv", as_csv(people))
-        write_json(store.out / "summary.json", summary.as_dict())
+            _write(store.out / "people.csv", as_csv(people), within)
+        write_json(store.out / "summary.json", summary.as_dict(), within=within)
         if drawing is not None:
             from spt_jax.datasets.report import page
 
-            _write(store, "report.html", page(store, rows, summary, why_not))
+            _write(store.out / "report.html", page(store, rows, summary, why_not), within)
     return summary
 
 
@@ -101,8 +104,8 @@ def _rows(store: Store, found: Inventory) -> list[dict[str, Any]]:
     return [row for item in found.items if (row := store.row(item.name)) is not None]
 
 
-def _write(store: Store, name: str, text: str) -> None:
-    with atomic_write(store.out / name) as temporary:
+def _write(path: Path, text: str, within: Path) -> None:
+    with atomic_write(path, within=within) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
 
 

@@ -37,7 +37,7 @@ def ensure_folder(path: str | os.PathLike[str]) -> Path:
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str], *, within: Path | None = None) -> Iterator[Path]:
     """Yield a temporary path beside `path` that takes its place when the block ends well.
 
     Whatever ends the block early, KeyboardInterrupt included, removes the temporary file and leaves
@@ -45,6 +45,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Args:
         path: where the file is to stand; its folder must exist.
+        within: where the temporary file is to stand, on the same disk; beside `path` if None. A
+            process that is killed leaves it there.
 
     Raises:
         OSError: the folder is missing, full or cannot be written, or `path` is itself a folder.
@@ -61,11 +63,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.is_dir():
         raise IsADirectoryError(f"path must name a file: got the folder {str(target)!r}")
     # The suffix stays last: trimesh and NumPy choose or extend the format by it.
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}{target.suffix}")
+    name = f".{target.stem}.{secrets.token_hex(6)}{target.suffix}"
+    temporary = target.with_name(name) if within is None else within / name
     try:
         temporary.touch(exist_ok=False)
     except OSError as error:
-        raise folder_error(target.parent, error) from error
+        raise folder_error(temporary.parent, error) from error
     try:
         yield temporary
         os.replace(temporary, target)
@@ -79,7 +82,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
+def write_json(path: str | os.PathLike[str], value: Any, *, within: Path | None = None) -> None:
     """Write a value as indented JSON, atomically; arrays become lists and paths strings.
 
     Raises:
@@ -101,7 +104,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         text = json.dumps(value, indent=2, default=plain, allow_nan=False)
     except ValueError as error:
         raise ValueError(f"value must be finite to be written as JSON: got {error}") from error
-    with atomic_write(path) as temporary:
+    with atomic_write(path, within=within) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

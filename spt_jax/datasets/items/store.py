@@ -68,12 +68,12 @@ class Store:
         ensure_folder(self.folder)
         path = self.folder / "settings.json"
         given = json.loads(json.dumps(settings))
-        with self.whole():
+        with self.writing() as within:
             if anew:
                 shutil.rmtree(self.folder / "rows", ignore_errors=True)
                 path.unlink(missing_ok=True)
             if not path.exists():
-                write_json(path, given)
+                write_json(path, given, within=within)
                 return
             before = read_json(path, "settings")
         wrong = [key for key in {**given, **before} if given.get(key) != before.get(key)]
@@ -116,13 +116,35 @@ class Store:
     @contextmanager
     def staging(self, name: str) -> Iterator[Path]:
         """An empty folder for the outputs of a file that is claimed, gone afterwards."""
-        folder = self.folder / "staging" / self.key(name)
+        folder = self._staging / self.key(name)
         shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
-        folder.mkdir(parents=True)
+        outputs = folder / "outputs"
+        outputs.mkdir(parents=True)
         try:
-            yield folder
+            yield outputs
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+    def sweep(self) -> None:
+        """Remove what processes that were killed left of files that nobody works on."""
+        with suppress(OSError):
+            for folder in list(self._staging.iterdir()):
+                place = _place(folder.name)
+                with _claims.lock(self.folder / "claims", place, wait=False, sure=True) as taken:
+                    if taken:
+                        shutil.rmtree(folder, ignore_errors=True)
+
+    @contextmanager
+    def writing(self) -> Iterator[Path]:
+        """Nobody else begins or ends a run; a folder for what is half written, gone afterwards."""
+        folder = self.folder / "writing"
+        with _claims.lock(self.folder / "claims", _WHOLE, wait=True):
+            shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
+            folder.mkdir()
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def forget(self, name: str) -> None:
         """A file is not done any more."""
@@ -130,6 +152,10 @@ class Store:
 
     def commit(self, row: dict[str, Any], staged: Path) -> dict[str, Any]:
         """Put outputs in their places and then the row; the row.
+
+        Args:
+            row: of the file.
+            staged: what `staging` gave for it.
 
         Outputs that an earlier row of the file names, and this one does not, are removed.
 
@@ -150,26 +176,28 @@ class Store:
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(path, target)
         self._row(row["name"]).parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(self._row(row["name"])) as temporary:
+        with atomic_write(self._row(row["name"]), within=staged.parent) as temporary:
             temporary.write_text(json.dumps(row, allow_nan=False), encoding="utf-8")
         return row
 
     @contextmanager
     def claim(self, name: str) -> Iterator[bool]:
         """Whether the file is this process' to work on while the block runs; it does not wait."""
-        place = 1 + int(self.key(name)[:15], 16)
-        with _claims.lock(self.folder / "claims", place, wait=False) as taken:
+        with _claims.lock(self.folder / "claims", _place(self.key(name)), wait=False) as taken:
             yield taken
 
-    @contextmanager
-    def whole(self) -> Iterator[None]:
-        """Nobody else begins or ends a run while the block runs."""
-        with _claims.lock(self.folder / "claims", _WHOLE, wait=True):
-            yield
+    @property
+    def _staging(self) -> Path:
+        return self.folder / "staging"
 
     def _row(self, name: str) -> Path:
         key = self.key(name)
         return self.folder / "rows" / key[:2] / f"{key}.json"
+
+
+def _place(key: str) -> int:
+    """The byte of `claims` that stands for a file, by the hash of its name."""
+    return 1 + int(key[:15], 16)
 
 
 def outputs_in(staged: Path) -> list[Path]:
@@ -201,7 +229,14 @@ class _Claims:
         self._changed = threading.Condition()
 
     @contextmanager
-    def lock(self, file: Path, place: int, *, wait: bool) -> Iterator[bool]:
+    def lock(self, file: Path, place: int, *, wait: bool, sure: bool = False) -> Iterator[bool]:
+        """Whether a byte is locked while the block runs.
+
+        Args:
+            file, place: the byte.
+            wait: for whoever has it.
+            sure: False where the file system has no locks; else that goes for locked.
+        """
         key = (str(file.resolve()), place)
         with self._changed:
             while key in self._own:
@@ -218,7 +253,7 @@ class _Claims:
             descriptor = self._descriptor(file, key[0])
             taken = _lock(descriptor, place, wait)
             try:
-                yield taken
+                yield bool(taken) or (taken is None and not sure)
             finally:
                 if taken and fcntl is not None:
                     _quietly(fcntl.lockf, descriptor, fcntl.LOCK_UN, 1, place)
@@ -244,9 +279,10 @@ def _is_open_at(descriptor: int, file: Path) -> bool:
         return False
 
 
-def _lock(descriptor: int, place: int, wait: bool) -> bool:
+def _lock(descriptor: int, place: int, wait: bool) -> bool | None:
+    """Whether it is locked; None where there are no locks."""
     if fcntl is None:
-        return True
+        return None
     try:
         fcntl.lockf(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, place)
     except (BlockingIOError, PermissionError):
@@ -254,6 +290,7 @@ def _lock(descriptor: int, place: int, wait: bool) -> bool:
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
+        return None
     return True
 
 
