@@ -5,7 +5,7 @@ from typing import Literal
 
 import tyro
 
-from spt_jax.cli.datasets import over_folder
+from spt_jax.cli.datasets import RunOptions, over_folder
 
 
 def clean(
@@ -18,20 +18,8 @@ def clean(
     fold_distance: float | None = None,
     margin: float = 0.002,
     feet: float = 20.0,
-    engine: Literal["local", "ray"] = "local",
-    processes: int | Literal["auto"] = "auto",
-    shard: str | None = None,
-    ray_address: str | None = None,
-    ray_cpus: float = 1.0,
-    ray_memory: int | None = None,
-    ray_retries: int = 3,
-    anew: bool = False,
-    retry: bool = False,
-    verify: bool = False,
     pictures: int = 10,
-    max_bytes: int | None = None,
-    json: bool = False,
-    quiet: bool = False,
+    run: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions(),
 ) -> int:
     """Free every motion of a folder from collisions, as smooth as it was, into another folder.
 
@@ -52,20 +40,8 @@ def clean(
             is a fold; not given: as near as the place allows.
         margin: how far apart colliding parts are pushed, in metres.
         feet: how strongly feet that stand are held, against the whole skin.
-        engine: "local", processes of this machine, or "ray", a Ray cluster.
-        processes: how many, each of one core and 1 GB; "auto": as many as there is room for.
-        shard: i/n with i from 0: one of n parts of the files alone, for job arrays.
-        ray_address: of the cluster; not given: RAY_ADDRESS, or one on this machine.
-        ray_cpus: cores that each file asks of the cluster.
-        ray_memory: bytes that each file asks of the cluster.
-        ray_retries: how often a file is tried again whose process or node has ended.
-        anew: do what is done again, with whatever settings it was made.
-        retry: try files again that failed.
-        verify: compare what is done with its hashes, not its sizes alone.
         pictures: how many of the worst files the report shows.
-        max_bytes: how large a file may be, and its arrays once unpacked; not given: 1 GiB.
-        json: print the summary as JSON in place of the table.
-        quiet: print errors alone.
+        run: how the files are worked on.
     """
     from spt_jax.datasets import clean as start
 
@@ -73,6 +49,7 @@ def clean(
         start,
         folder,
         out,
+        run,
         body=body,
         structure=structure,
         frame_rate=frame_rate,
@@ -80,15 +57,5 @@ def clean(
         fold_distance=fold_distance,
         margin=margin,
         feet=feet,
-        engine=engine,
-        processes=processes,
-        shard=shard,
-        ray=(ray_address, ray_cpus, ray_memory, ray_retries),
-        anew=anew,
-        retry=retry,
-        verify=verify,
         pictures=pictures,
-        max_bytes=max_bytes,
-        json=json,
-        quiet=quiet,
     )

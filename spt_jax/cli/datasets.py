@@ -4,8 +4,9 @@ import json as json_format
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
@@ -23,21 +24,55 @@ _UNITS = {"volume": ("cm³", 1e6), "ratio": ("%", 100.0)}
 _LENGTHS = ("depth", "displacement", "difference")
 
 
+# Options that every task takes as they are.
+_OF_ANY_TASK = ("engine", "processes", "shard", "anew", "retry", "verify", "max_bytes")
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How the files of a folder are worked on, and what is said of it.
+
+    Attributes:
+        engine: "local", processes of this machine, or "ray", a Ray cluster.
+        processes: how many, each of one core and 1 GB; "auto": as many as there is room for.
+        shard: i/n with i from 0: one of n parts of the files alone, for job arrays.
+        ray_address: of the cluster; not given: RAY_ADDRESS, or one on this machine.
+        ray_cpus: cores that each file asks of the cluster.
+        ray_memory: bytes that each file asks of the cluster.
+        ray_retries: how often a file is tried again whose process or node has ended.
+        anew: do what is done again, with whatever settings it was made.
+        retry: try files again that failed.
+        verify: compare what is done with its hashes, not its sizes alone.
+        max_bytes: how large a file may be, and its arrays once unpacked; not given: 1 GiB.
+        json: print the summary as JSON in place of the table.
+        quiet: print errors alone.
+    """
+
+    engine: Literal["local", "ray"] = "local"
+    processes: int | Literal["auto"] = "auto"
+    shard: str | None = None
+    ray_address: str | None = None
+    ray_cpus: float = 1.0
+    ray_memory: int | None = None
+    ray_retries: int = 3
+    anew: bool = False
+    retry: bool = False
+    verify: bool = False
+    max_bytes: int | None = None
+    json: bool = False
+    quiet: bool = False
+
+
 def over_folder(
-    start: Callable[..., "Summary"],
-    folder: Path,
-    out: Path,
-    *,
-    json: bool,
-    quiet: bool,
-    ray: tuple[str | None, float, int | None, int],
-    **options: Any,
+    start: Callable[..., "Summary"], folder: Path, out: Path, run: RunOptions, **options: Any
 ) -> int:
     """Run a task over a folder with bars on the way, and tell what came of it; the exit code.
 
     Args:
         start: `spt_jax.datasets.clean` or another.
-        ray: address, cores, memory and retries of a call.
+        folder: the data set.
+        out: where the results go.
+        run: how.
         options: of `start`.
 
     Raises:
@@ -45,16 +80,18 @@ def over_folder(
     """
     from spt_jax.datasets.engines.cluster import Resources
 
+    options |= {name: getattr(run, name) for name in _OF_ANY_TASK}
+    ray = Resources(run.ray_address, run.ray_cpus, run.ray_memory, run.ray_retries)
     try:
-        with _ended_by_sigterm(), _bars(quiet) as on_event:
-            summary = start(folder, out, ray=Resources(*ray), on_event=on_event, **options)
+        with _ended_by_sigterm(), _bars(run.quiet) as on_event:
+            summary = start(folder, out, ray=ray, on_event=on_event, **options)
     except (OSError, TypeError, ValueError, RuntimeError) as error:
         raise CommandError(" ".join(str(error).split())) from error
-    if json:
+    if run.json:
         print(json_format.dumps(summary.as_dict(), indent=2))
     else:
-        tell(summary, out, out_console(quiet))
-    if not quiet:
+        tell(summary, out, out_console(run.quiet))
+    if not run.quiet:
         _warn(summary, out)
     return 1 if {"failed", "lost"} & set(summary.by_status) else 0
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import tyro
 
-from spt_jax.cli.datasets import folder_camera, over_folder, refuse_for_folder
+from spt_jax.cli.datasets import RunOptions, folder_camera, over_folder, refuse_for_folder
 from spt_jax.cli.terminal import (
     CommandError,
     err_console,
@@ -128,6 +128,17 @@ def fit(
             start_fit,
             keypoints,
             out,
+            RunOptions(
+                engine=engine,
+                processes=processes,
+                shard=shard,
+                ray_address=ray_address,
+                anew=anew,
+                retry=retry,
+                max_bytes=max_bytes,
+                json=json,
+                quiet=quiet,
+            ),
             layout=layout,
             camera=seen,
             body=body,
@@ -135,15 +146,6 @@ def fit(
             fold_distance=fold_distance,
             robust=robust,
             fit_shape=fit_shape,
-            engine=engine,
-            processes=processes,
-            shard=shard,
-            ray=(ray_address, 1.0, None, 3),
-            anew=anew,
-            retry=retry,
-            max_bytes=max_bytes,
-            json=json,
-            quiet=quiet,
         )
     from spt_jax._exclusions import as_fold_distance
     from spt_jax.cli.annotated import as_map, gather, of_the_body, tracks_of

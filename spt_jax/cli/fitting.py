@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,23 +13,14 @@ from spt_jax.cli.annotated import Annotated
 from spt_jax.cli.fitted import Fitted, as_fitted
 from spt_jax.cli.kept import people_arrays, people_of
 from spt_jax.cli.terminal import State, user_errors
+from spt_jax.keypoints.mistakes import Robust, robust_scale
 
 if TYPE_CHECKING:
     from spt_jax.body import BodyModel
     from spt_jax.cli.unfinished import UnfinishedRun
 
-Robust = float | Literal["auto", "off"]
-
-# Detectors make mistakes, and a square counts one of them for more than all the rest. Mean joint
-# error of 24 motion-capture frames with 5 pixels of noise (2 % of the person), when none, one or
-# two of the 17 keypoints are off by 20 to 50 % of the person: 70, 200, 279 mm with plain squares;
-# 73, 102, 98 mm with this scale; 74, 141, 181 mm with twice as much. Half of it, 72, 74, 86 mm,
-# takes good points of unusual poses for mistakes: in 11 of 48 people who were seen in part, where
-# this scale did in 2.
-_ROBUST_SHARE = 0.1
 # How much an angle changes from frame to frame of a sequence, in radians: as `fit_motion` has it.
 _SPEED = 0.15
-_LEAST_SCALE = 5.0  # pixels, of somebody of whom a point or two are seen
 
 
 def scenes_of(people: Sequence[Annotated]) -> list[list[Annotated]]:
@@ -125,7 +116,7 @@ def fit_everyone(
             "regularizer": prepared,
             "start": Start(fit_shape=fit_shape),
         }
-        scales = _robust_scales(group, robust)
+        scales = [robust_scale(one.person, robust) for one in group]  # None, all of them, if off
         last = before.get(tracks[group[0].name]) if tracks else None
         prior: GaussianPosePrior = usual
         if last is not None and last.usable:
@@ -136,7 +127,7 @@ def fit_everyone(
         scene = None
         if len(group) > 1:
             options |= {
-                "terms": Terms(robust=scales),
+                "terms": Terms(robust=None if robust == "off" else np.array(scales)),
                 "scene": Scene(fold_distance=fold_distance),
             }
             together = scenes.fit_people(body, points, group[0].camera, **options)
@@ -150,7 +141,7 @@ def fit_everyone(
         else:
             options |= {
                 "confidence": options["confidence"][0],
-                "terms": Terms(prior=prior, robust=None if scales is None else scales[0]),
+                "terms": Terms(prior=prior, robust=scales[0]),
             }
             result = fitting.fit_pose(body, points[0], group[0].camera, **options)
             results = jax.tree.map(lambda leaf: leaf[None], result)
@@ -173,13 +164,3 @@ def fit_everyone(
 def _ends_of(people: Sequence[Fitted], tracks: Mapping[str, int] | None) -> dict[int, Fitted]:
     """By track, who was fitted last."""
     return {tracks[one.name]: one for one in people} if tracks else {}
-
-
-def _robust_scales(people: Sequence[Annotated], robust: Robust) -> np.ndarray | None:
-    if robust == "off":
-        return None
-    if robust != "auto":
-        return np.full(len(people), robust, np.float32)
-    seen = [one.person.points[one.person.confidence > 0] for one in people]
-    sides = np.array([float(np.ptp(points, axis=0).max()) for points in seen], np.float32)
-    return np.maximum(_ROBUST_SHARE * sides, np.float32(_LEAST_SCALE))

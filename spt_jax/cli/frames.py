@@ -1,5 +1,6 @@
 """Frames untangled one after the other, with what is shown and written of them."""
 
+import json as json_format
 import re
 import time
 from collections.abc import Iterable, Sequence
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from spt_jax.cli.terminal import State, measurable, user_errors
+from spt_jax.cli.terminal import State, measurable, out_console, show, user_errors
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -213,6 +214,38 @@ def left_out(before: Iterable["IntersectionReport"], after: Iterable["Intersecti
     if len(parts) == 1:
         return f"left out as folds: {parts[0][0]}"
     return "left out as folds: " + ", ".join(f"{what} {when}" for what, when in parts)
+
+
+def tell(
+    frames: Sequence[Frame],
+    report: dict[str, Any],
+    folder: Path,
+    *,
+    json: bool,
+    quiet: bool,
+    table: "Table | None" = None,
+    line: str | None = None,
+) -> None:
+    """Print what came of frames: the report as JSON, or a table, a summary and what was written.
+
+    Args:
+        frames: what was done.
+        report: with the names of the "meshes" and "files" written.
+        folder: where they are.
+        json: print the report.
+        quiet: print errors alone.
+        table: in place of `before_after_table`.
+        line: in place of `summary`.
+    """
+    if json:
+        print(json_format.dumps(report, indent=2))
+        return
+    console = out_console(quiet)
+    console.print(before_after_table(frames) if table is None else table)
+    show(console, summary(frames) if line is None else line)
+    show(console, left_out((f.before for f in frames), (f.after for f in frames)))
+    also = f", {len(report['meshes'])} meshes (.glb)" if report["meshes"] else ""
+    show(console, f"in {folder}: {', '.join(report['files'])}, report.json{also}")
 
 
 def as_report(command: str, frames: Sequence[Frame], settings: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from spt_jax.cli.frames import Motion, made_from
 from spt_jax.cli.motion_frames import (
     Piece,
     as_motion_report,
+    chosen_up,
     counted_apart,
     motions_summary,
     motions_table,
@@ -17,7 +18,6 @@ from spt_jax.cli.motion_frames import (
     rate_of,
     remove_kept,
     untangle_pieces,
-    up_of,
     write_animations,
 )
 from spt_jax.cli.motions import Chosen, write_like_input, write_motions
@@ -68,7 +68,7 @@ def untangle_as_motions(
     say = partial(show, err_console(wanted.quiet))
     with user_errors():
         rate, unknown = rate_of(asked, wanted.fps)
-        up, guessed = up_of(body, motion, wanted.up)
+        up, guessed = chosen_up(body, motion, wanted.up)
     fresh = [note for note in (unknown, guessed) if note is not None]
     if len(pieces) == 1 and len(pieces[0].rows) > 1:
         fresh.append(f"{len(pieces[0].rows)} people as one scene; none is moved as a whole")

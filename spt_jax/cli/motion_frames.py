@@ -11,6 +11,7 @@ from jaxtyping import Float
 from spt_jax.cli.frames import Motion, versions
 from spt_jax.cli.motions import Chosen
 from spt_jax.cli.terminal import State, user_errors
+from spt_jax.untangle.motion_input import up_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -110,7 +111,7 @@ def rate_of(asked: Chosen, fps: float | None) -> tuple[float, str | None]:
     return RATE, f"the file has no frame rate; {RATE:g} frames a second are assumed (--fps)"
 
 
-def up_of(body: "BodyModel", motion: Motion, up: str) -> tuple[tuple[float, ...], str | None]:
+def chosen_up(body: "BodyModel", motion: Motion, up: str) -> tuple[tuple[float, ...], str | None]:
     """The direction that is up, and a note where it is told by where the heads are.
 
     Raises:
@@ -121,18 +122,11 @@ def up_of(body: "BodyModel", motion: Motion, up: str) -> tuple[tuple[float, ...]
         if name not in _UP:
             raise ValueError(f'up must be x, y, z, one of them with a "-", or auto: got {up!r}.')
         return tuple(float(-x if up.startswith("-") else x) for x in _UP[name]), None
-    names = body.joint_names
-    top = names.index("head") if "head" in names else len(names) - 1
-    # Of up to 64 frames, a joint alone: no vertex is posed.
-    some = np.unique(np.linspace(0, len(motion.pose) - 1, 64).astype(int))
-    joints = np.asarray(body.at_vertices([])(motion.pose[some]).joints)
-    mean = (joints[:, top] - joints[:, 0]).mean(axis=0)
-    axis = int(np.abs(mean).argmax())
-    direction = [0.0, 0.0, 0.0]
-    direction[axis] = float(np.sign(mean[axis])) or 1.0
+    direction = up_of(body, motion.pose)
+    axis = int(np.abs(direction).argmax())
     sign = "-" if direction[axis] < 0 else ""
     said = f"up is taken to be {sign}{'xyz'[axis]}, where heads are above hips (--up)"
-    return tuple(direction), said
+    return direction, said
 
 
 def untangle_pieces(

@@ -1,6 +1,5 @@
 """`spt-jax untangle RIG`: the animations of a rigged character, freed and written back."""
 
-import json as json_format
 import re
 from collections.abc import Sequence
 from functools import partial
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spt_jax.cli.frames import Frame, Motion
-from spt_jax.cli.terminal import err_console, out_console, progress_bar, show, user_errors
+from spt_jax.cli.terminal import err_console, progress_bar, show, user_errors
 
 if TYPE_CHECKING:
     from spt_jax.io.rigs.clips import Clip
@@ -47,10 +46,8 @@ def untangle_rig_file(
     with progress_bar(len(places), quiet) as state:
         from spt_jax.cli.frames import (
             as_report,
-            before_after_table,
-            left_out,
             made_from,
-            summary,
+            tell,
             untangle_frames,
             write_meshes,
         )
@@ -79,15 +76,7 @@ def untangle_rig_file(
                 }
                 write_json(folder / "report.json", report)
                 run.finish()
-    if json:
-        print(json_format.dumps(report, indent=2))
-        return 0
-    console = out_console(quiet)
-    console.print(before_after_table(done))
-    show(console, summary(done))
-    show(console, left_out((f.before for f in done), (f.after for f in done)))
-    also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
-    show(console, f"in {folder}: {', '.join(files)}, report.json{also}")
+    tell(done, report, folder, json=json, quiet=quiet)
     return 0
 
 

@@ -1,6 +1,5 @@
 """`spt-jax untangle FILE --together`: the people of a pose file as scenes, frame by frame."""
 
-import json as json_format
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -9,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from spt_jax.cli.frames import Frame, Motion, as_report, left_out, made_from, untangle_frames
+from spt_jax.cli.frames import Frame, Motion, as_report, made_from, tell, untangle_frames
 from spt_jax.cli.motions import Chosen, motion_of, write_motions
-from spt_jax.cli.terminal import err_console, out_console, progress_bar, show, user_errors
+from spt_jax.cli.terminal import err_console, progress_bar, show, user_errors
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -123,15 +122,8 @@ def untangle_together(
                 report |= {"structure": asked.file.structure, "files": files, "notes": notes}
                 write_json(folder / "report.json", report)
                 run.finish()
-    if json:
-        print(json_format.dumps(report, indent=2))
-        return 0
-    console = out_console(quiet)
-    console.print(_table(done, counted, scenes))
-    show(console, _summary(done, counted))
-    show(console, left_out((f.before for f in done), (f.after for f in done)))
-    also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
-    show(console, f"in {folder}: {', '.join(files)}, report.json{also}")
+    table, line = _table(done, counted, scenes), _summary(done, counted)
+    tell(done, report, folder, json=json, quiet=quiet, table=table, line=line)
     return 0
 
 

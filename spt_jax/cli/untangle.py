@@ -1,6 +1,5 @@
 """`spt-jax untangle`: a pose file or a mesh file, freed of self-intersections."""
 
-import json as json_format
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -11,7 +10,6 @@ from spt_jax.cli.mesh import untangle_mesh_file
 from spt_jax.cli.rigs import untangle_rig_file
 from spt_jax.cli.terminal import (
     err_console,
-    out_console,
     progress_bar,
     show,
     user_errors,
@@ -179,10 +177,8 @@ def untangle(
         from spt_jax.body import load_body
         from spt_jax.cli.frames import (
             as_report,
-            before_after_table,
-            left_out,
             made_from,
-            summary,
+            tell,
             untangle_frames,
             write_meshes,
         )
@@ -232,15 +228,7 @@ def untangle(
                 report["files"], report["notes"] = files, notes
                 write_json(folder / "report.json", report)
                 run.finish()
-    if json:
-        print(json_format.dumps(report, indent=2))
-        return 0
-    console = out_console(quiet)
-    console.print(before_after_table(done))
-    show(console, summary(done))
-    show(console, left_out((f.before for f in done), (f.after for f in done)))
-    also = f", {len(report['meshes'])} meshes (.glb)" if meshes else ""
-    show(console, f"in {folder}: {', '.join(files)}, report.json{also}")
+    tell(done, report, folder, json=json, quiet=quiet)
     return 0
 
 

@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from spt_jax.datasets.items.work import Report, UnknownFileError
 from spt_jax.datasets.motions import as_body_key, as_fold_distance_given
 from spt_jax.datasets.runs import run
 from spt_jax.datasets.summary import Summary
+from spt_jax.keypoints.mistakes import Robust, robust_scale
 
 if TYPE_CHECKING:
     from spt_jax._camera import PinholeCamera
@@ -22,10 +23,6 @@ if TYPE_CHECKING:
     from spt_jax.keypoints import KeypointFile
     from spt_jax.keypoints.entries import Person
 
-Robust = float | Literal["auto", "off"]
-
-# As `spt-jax fit` has it for one file (`spt_jax/cli/fitting.py` says why).
-_ROBUST_SHARE, _LEAST_SCALE = 0.1, 5.0
 _LEAST_SIDE = 64.0
 
 
@@ -176,16 +173,6 @@ class FitKeypoints:
             except Unmeasurable:
                 pass
         return result, figures
-
-
-def robust_scale(person: "Person", robust: Robust) -> np.float32 | None:
-    """How far off, in pixels, a keypoint of somebody is half taken for a mistake."""
-    if robust == "off":
-        return None
-    if robust != "auto":
-        return np.float32(robust)
-    side = float(np.ptp(person.points[person.confidence > 0], axis=0).max())
-    return np.float32(max(_ROBUST_SHARE * side, _LEAST_SCALE))
 
 
 def _camera_of(people: Sequence["Person"]) -> "PinholeCamera":

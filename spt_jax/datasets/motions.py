@@ -170,13 +170,13 @@ class CleanMotions(MeasureMotions):
             in_track,
             on_body,
             second_differences,
-            up_of,
         )
         from spt_jax.untangle.motion import MotionStep, untangle_motion
+        from spt_jax.untangle.motion_input import up_of
 
         body = self._writable(track)
         posed = on_body(track, body, embedded=self.body == "anny")
-        up = up_of(posed.pose)
+        up = up_of(body, posed.pose)
 
         def on_step(step: MotionStep) -> None:
             report(done + step.first, total, f"{track.name}: {step.colliding} frames collide")

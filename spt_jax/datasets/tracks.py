@@ -4,13 +4,11 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from spt_jax.body import BodyModel
 from spt_jax.body.poses import SMPL_LAYOUTS
-from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.io.pose_files import Track
 
 # Frames that are posed at a time: one program does for any number.
@@ -79,19 +77,6 @@ def in_track(
             changed = (before[:, k] != after[:, k]).any(axis=1)
             pose[changed, joint] = after[changed, k]
     return pose
-
-
-def up_of(pose: Float[np.ndarray, "T J 3"]) -> tuple[float, float, float]:
-    """The axis, of six, along which the trunk points most in all: that is up.
-
-    AMASS has z up, most others y, and poses of cameras y down; no file says which.
-    """
-    turns = np.asarray(matrix_from_axis_angle(jnp.asarray(pose[:, 0])))
-    mean = turns[:, :, 1].mean(axis=0)
-    axis = int(np.argmax(np.abs(mean)))
-    up = [0.0, 0.0, 0.0]
-    up[axis] = 1.0 if mean[axis] >= 0 else -1.0
-    return up[0], up[1], up[2]
 
 
 @eqx.filter_jit

@@ -94,6 +94,27 @@ def as_up(up: Any) -> Float[np.ndarray, "3"]:
     return direction / np.linalg.norm(direction)
 
 
+def up_of(body: AbstractBody, pose: Any) -> tuple[float, float, float]:
+    """The axis, of six, along which heads are above roots in most of a motion: that is up.
+
+    AMASS has z up, most others y, and poses of cameras y down; no file says which.
+
+    Args:
+        body: any body whose pose is rotations of joints; without a "head", its last joint counts.
+        pose: (frames, J, 3); up to 64 frames of it are looked at.
+    """
+    names = body.joint_names
+    top = names.index("head") if "head" in names else len(names) - 1
+    some = np.unique(np.linspace(0, len(pose) - 1, 64).astype(int))
+    # A joint alone: no vertex is posed.
+    joints = np.asarray(body.at_vertices([])(jnp.asarray(np.asarray(pose)[some])).joints)
+    mean = (joints[:, top] - joints[:, 0]).mean(axis=0)
+    direction = [0.0, 0.0, 0.0]
+    axis = int(np.abs(mean).argmax())
+    direction[axis] = 1.0 if mean[axis] >= 0 else -1.0
+    return direction[0], direction[1], direction[2]
+
+
 def as_contacts(contacts: Any, body: AbstractBody, people: int) -> Int[np.ndarray, "C 2"]:
     """Pairs of vertices, numbered through all people.
 

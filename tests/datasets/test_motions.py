@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from helpers_motion import snap, tongs
 
-from spt_jax import datasets
+from spt_jax import datasets, load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.cli.main import main
 from spt_jax.datasets.motions import CleanMotions
-from spt_jax.datasets.tracks import up_of
 from spt_jax.io import load_poses
 from spt_jax.metrics import motion_overlap
+from spt_jax.untangle.motion_input import up_of
 
 LAYOUT = SMPL_LAYOUTS[22]
 
@@ -246,12 +246,13 @@ def test_faults_of_the_caller(folder, tmp_path, capsys):
 
 
 def test_which_way_is_up():
-    turn = np.zeros((5, 22, 3))
-    assert up_of(turn) == (0.0, 1.0, 0.0)
+    body = load_body()
+    turn = np.zeros((5, *body.pose_shape), np.float32)
+    assert up_of(body, turn) == (0.0, 1.0, 0.0)
     turn[:, 0, 0] = np.pi / 2 + 0.2  # as AMASS has it, leaning
-    assert up_of(turn) == (0.0, 0.0, 1.0)
+    assert up_of(body, turn) == (0.0, 0.0, 1.0)
     turn[:, 0, 0] = np.pi
-    assert up_of(turn) == (0.0, -1.0, 0.0)
+    assert up_of(body, turn) == (0.0, -1.0, 0.0)
 
 
 def test_a_task_travels_to_another_process_without_its_body():

@@ -103,7 +103,7 @@ EXPECTED = {
     "recipes/pose-files.md": prints("walk (5, 22, 3) 120.0 female", "free of 52 joints"),
     "recipes/datasets.md": prints("{'done': 2} {'.txt': 1}", "of 6 frames collide, 0 after"),
     "recipes/motions.md": prints(
-        "after: 0", "of 5", "leave it out: False False", "'motion.glb'", "cm^3", "mm deep", "in contact"
+        "after: 0", "leave it out: False False", "'motion.glb'", "cm^3", "mm deep", "in contact"
     ),
     "recipes/people.md": what_is_between_and_within_adds_up,
     "recipes/keypoints.md": fits,
