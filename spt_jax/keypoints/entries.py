@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from spt_jax.keypoints.confidences import shown
 from spt_jax.keypoints.layout import Layout
-from spt_jax.keypoints.layouts import LAYOUTS, as_layout
+from spt_jax.keypoints.layouts import LAYOUTS, as_layout, layouts_of_count
 
 #: Confidence of a point that COCO's annotators marked as hidden (v = 1): they guessed its place.
 OCCLUDED = 0.5
@@ -106,7 +106,7 @@ def choose_layout(
             return LAYOUTS[name], flat
     counts = " or ".join(f"{len(LAYOUTS[name].names)} ({name})" for name in usual)
     rule = f"must have {counts} keypoints" if usual else "needs a layout, which the file lacks"
-    fitting = [name for name, layout in LAYOUTS.items() if len(layout.names) == count]
+    fitting = layouts_of_count(count)
     raise ValueError(
         f"{where} {rule}: got {count}; name the layout that it has, one of "
         f"{', '.join(fitting or LAYOUTS)}."

@@ -10,6 +10,11 @@ from spt_jax.keypoints.whole_tables import WHOLE_BODIES
 LAYOUTS: dict[str, Layout] = {layout.name: layout for layout in (*BODIES, *WHOLE_BODIES)}
 
 
+def layouts_of_count(count: int) -> list[str]:
+    """The names of the layouts of that many keypoints."""
+    return [name for name, layout in LAYOUTS.items() if len(layout.names) == count]
+
+
 def as_layout(name: str, count: int | None = None) -> Layout:
     """The layout of that name; "smpl" is SMPL's with `count` joints.
 

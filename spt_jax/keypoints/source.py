@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from spt_jax.keypoints.confidences import as_rows, shape_of, shown
 from spt_jax.keypoints.entries import Order, Person, as_points, choose_layout
-from spt_jax.keypoints.layouts import LAYOUTS
 from spt_jax.keypoints.vocabulary import layout_of, places_of
 
 ACCEPTED = (
@@ -171,8 +170,3 @@ def _rows(values: Any, width: int) -> list[Any]:
     if isinstance(values[0], list):
         return values
     return [values[k : k + width] for k in range(0, len(values), width)]
-
-
-def layouts_of_count(count: int) -> list[str]:
-    """The layouts of that many keypoints."""
-    return [name for name, layout in LAYOUTS.items() if len(layout.names) == count]

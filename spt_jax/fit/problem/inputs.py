@@ -13,8 +13,9 @@ from jaxtyping import Array, Float
 
 from spt_jax.body import BodyModel
 from spt_jax.fit.problem.variables import Variables
-from spt_jax.keypoints import LAYOUTS, AnyLayout
+from spt_jax.keypoints import AnyLayout
 from spt_jax.keypoints import Person as SeenPerson
+from spt_jax.keypoints.layouts import layouts_of_count
 
 #: Keypoints as users have them: pixels, or people with a layout and confidences of their own.
 Keypoints: TypeAlias = ArrayLike | Sequence[Any] | SeenPerson | Sequence[SeenPerson]
@@ -47,7 +48,7 @@ def as_seen_points(
     if not (isinstance(people, (list, tuple)) and people and isinstance(people[0], SeenPerson)):
         if layout is None:
             count = count_points(keypoints)
-            known = [f'"{name}"' for name, one in LAYOUTS.items() if len(one.names) == count]
+            known = [f'"{name}"' for name in layouts_of_count(count)]
             raise ValueError(
                 f"layout must say what the {count} keypoints are: got none; "
                 + (f"{' or '.join(known)} has so many." if known else "give a list of names.")
