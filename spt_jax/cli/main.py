@@ -75,7 +75,13 @@ def _run(args: Sequence[str] | None) -> int:
             file=sys.stderr,
         )
         return 2
-    except ValueError as error:
+    except KeyboardInterrupt:
+        return _interrupted(args)
+    except (ValueError, RuntimeError) as error:
+        # What is heard within a callback JAX hands on as one of these, as it is dispatched at once
+        # or not, with the callback's traceback as its text.
+        if "CpuCallback error" in str(error) and "KeyboardInterrupt" in str(error):
+            return _interrupted(args)
         # Imported here: not every command measures something.
         from spt_jax.overlap.measure import Unmeasurable
 
@@ -83,11 +89,13 @@ def _run(args: Sequence[str] | None) -> int:
             raise
         print(f"spt-jax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("spt-jax: interrupted; no file is left half-written", file=sys.stderr)
-        if args is None:
-            _leave_at_once(130)
-        return 130
+
+
+def _interrupted(args: Sequence[str] | None) -> int:
+    print("spt-jax: interrupted; no file is left half-written", file=sys.stderr)
+    if args is None:
+        _leave_at_once(130)
+    return 130
 
 
 def _leave_at_once(code: int) -> NoReturn:

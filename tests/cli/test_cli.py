@@ -8,6 +8,8 @@ import sys
 import time
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -184,6 +186,19 @@ def test_ctrl_c_ends_the_process_cleanly_in_the_middle_of_a_computation(tmp_path
         process.kill()
     assert printed == ("", "spt-jax: interrupted; no file is left half-written\n")
     assert process.returncode == 130 and files_in(out) == []
+
+
+def test_ctrl_c_within_a_callback_is_an_interruption_too(tmp_path, capsys, monkeypatch):
+    def hears(*_, **__):
+        raise KeyboardInterrupt
+
+    def calls_back(*_, **__):
+        jax.jit(lambda x: jax.pure_callback(hears, x, x))(jnp.zeros(3)).block_until_ready()
+
+    monkeypatch.setattr("spt_jax.body.load_body", calls_back)
+    file = mocap_file(tmp_path / "m.npz", ["walk/0005"])
+    assert main(["untangle", file, "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "spt-jax: interrupted; no file is left half-written\n"
 
 
 def test_interrupted_while_it_writes(calls, tmp_path, capsys, monkeypatch):
