@@ -91,7 +91,8 @@ class Search(eqx.Module):
         return [(self.margin, weight) for weight in self.weights] + again
 
 
-@program
+# As the body is posed elsewhere: the last bit of what need not move hangs on how it is compiled.
+@eqx.filter_jit
 def vertices_of(body, pose, shape, translation) -> Float[Array, "V 3"]:
     """The vertices of a posed body."""
     return body(pose, shape, translation).vertices
