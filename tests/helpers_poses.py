@@ -178,7 +178,7 @@ def smplifyx():
         "betas": betas[None], "global_orient": pose[:, 0], "body_pose": flat(pose[:, 1:22]),
         "left_hand_pose": np.ones((1, 12)), "right_hand_pose": np.ones((1, 12)),
         "jaw_pose": pose[:, 22], "leye_pose": pose[:, 23], "reye_pose": pose[:, 24],
-        "expression": np.zeros((1, 10)),
+        "expression": np.full((1, 10), 0.2),
     }  # fmt: skip
     return Made(pickle.dumps(value, protocol=2), ".pkl", {"": pose}, {}, {"": betas[None]})
 

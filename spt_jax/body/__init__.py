@@ -3,6 +3,7 @@
 from spt_jax.body.adapt import adapt as adapt
 from spt_jax.body.base import AbstractBody as AbstractBody
 from spt_jax.body.base import PosedBody as PosedBody
+from spt_jax.body.expressions import expression_as_shape as expression_as_shape
 from spt_jax.body.files import load_body as load_body
 from spt_jax.body.group import BodyGroup as BodyGroup
 from spt_jax.body.hands import Hand as Hand

@@ -27,12 +27,16 @@ _CUBIC_CENTIMETRES = 1e6  # in a cubic metre
 
 @dataclass(frozen=True)
 class Motion:
-    """Frames of one body: names, poses in the body's own joints, and what goes with them."""
+    """Frames of one body: names, poses in the body's own joints, and what goes with them.
+
+    Of the shape's columns the last `expressions` are those of the face.
+    """
 
     names: list[str]
     pose: Float[np.ndarray, "N J 3"]
     shape: Float[np.ndarray, "N B"] | None = None
     translation: Float[np.ndarray, "N 3"] | None = None
+    expressions: int = 0
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,16 @@
-"""Tracks of a pose file as the frames of one motion of a body, and back into files."""
+"""What of a pose file is asked for, and how its motions are written when they are done."""
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.cli.frames import Motion
 from spt_jax.io.pose_files import MotionFile, Track, choose, open_poses, write_poses
-
-if TYPE_CHECKING:
-    from spt_jax.body import BodyModel
 
 
 class HasPose(Protocol):
@@ -48,6 +45,12 @@ class Chosen:
         """How many shape components the body should have."""
         shapes = [track.shape.shape[-1] for track in self.tracks if track.shape is not None]
         return max([10, *shapes])
+
+    @property
+    def num_expression(self) -> int:
+        """How many expressions the body should have: none where the file has none."""
+        faces = [track.expression for track in self.tracks if track.expression is not None]
+        return max([0, *(face.shape[-1] for face in faces if face.any())])
 
 
 def chosen(path: Path, people: str, frames: str, max_bytes: int | None) -> Chosen:
@@ -94,58 +97,7 @@ def select_frames(names: Sequence[str], wanted: str) -> list[int]:
     return list(dict.fromkeys(rows))
 
 
-def motion_of(asked: Chosen, model: "BodyModel", body: str) -> tuple[Motion, list[str]]:
-    """The frames asked for on the body, and what of them had to be left out."""
-    notes = list(asked.file.notes)
-    poses, lost = [], {}
-    for k, rows in _rows(asked):
-        track = asked.tracks[k]
-        pose = track.pose[rows]
-        turned = np.any(pose, axis=(0, 2)).tolist()
-        layout = SMPL_LAYOUTS[track.pose.shape[1]]
-        lost |= {
-            name: None
-            for name, used in zip(layout, turned, strict=True)
-            if used and name not in model.joint_names
-        }
-        posed = model.pose_from_smpl(pose.astype(np.float32))
-        poses.append(_with_hands(model, posed, track, rows, notes))
-    if lost:
-        shown = ", ".join(list(lost)[:4]) + (", ..." if len(lost) > 4 else "")
-        notes.append(f"the body lacks {shown}; their rotations are left out")
-    shape = _shapes(asked, model, body, notes)
-    shifts = [track.translation for track in asked.tracks]
-    translation = None
-    known = [shift for shift in shifts if shift is not None]
-    if len(known) == len(shifts):
-        translation = np.stack([known[k][row] for k, row in asked.rows]).astype(np.float32)
-    order = [(k, row) for k, rows in _rows(asked) for row in rows]
-    at = {place: number for number, place in enumerate(order)}
-    pose = np.concatenate(poses)[[at[place] for place in asked.rows]]
-    return Motion(asked.names, pose, shape, translation), notes
-
-
-def _with_hands(
-    model: "BodyModel", pose: Any, track: Track, rows: list[int], notes: list[str]
-) -> np.ndarray:
-    """The pose with the fingers that the file has as components of hands."""
-    known = {hand.side: len(hand.components) for hand in model.hands}
-    used: dict[str, np.ndarray] = {}
-    for side, given in (("left", track.left_hand), ("right", track.right_hand)):
-        if given is None:
-            continue
-        if given.shape[1] <= known.get(side, 0):
-            used[side] = given[rows].astype(np.float32)
-            continue
-        what = f"{known[side]} components" if side in known else "no components"
-        notes.append(
-            f"the body has {what} of the {side} hand, the file {given.shape[1]}: those fingers are "
-            "at rest"
-        )
-    return np.asarray(model.with_hands(pose, used.get("left"), used.get("right")))
-
-
-def _rows(asked: Chosen) -> list[tuple[int, list[int]]]:
+def rows_by_track(asked: Chosen) -> list[tuple[int, list[int]]]:
     """The frames asked for of each track, in the order of the tracks."""
     found: dict[int, list[int]] = {}
     for k, row in asked.rows:
@@ -153,54 +105,44 @@ def _rows(asked: Chosen) -> list[tuple[int, list[int]]]:
     return sorted(found.items())
 
 
-def _shapes(asked: Chosen, model: "BodyModel", body: str, notes: list[str]) -> np.ndarray | None:
-    given = [track.shape for track in asked.tracks]
-    if all(shape is None for shape in given):
-        return None
-    if body == "anny":
-        notes.append(
-            "the file's shape is in SMPL's components, which the embedded body does not have; "
-            "its mean shape is used (--body takes an SMPL file)"
-        )
-        return None
-    widest = max(shape.shape[-1] for shape in given if shape is not None)
-    if widest > model.num_shape:
-        notes.append(f"shape components after the body's {model.num_shape} are left out")
-    shapes = np.zeros((len(asked.rows), min(widest, model.num_shape)), np.float32)
-    for at, (k, row) in enumerate(asked.rows):
-        one = given[k]
-        if one is not None:
-            values = (one if one.ndim == 1 else one[row])[: shapes.shape[1]]
-            shapes[at, : len(values)] = values
-    return shapes
-
-
 def write_motions(
     folder: Path, done: Sequence[HasPose], motion: Motion, asked: Chosen
 ) -> list[str]:
     """Write the untangled poses in AMASS' layout, a file a person; return the files' names.
 
-    Shape, translation and gender come along, and the frame rate where the frames follow each other.
+    Shape, expression, translation and gender come along, and the frame rate where the frames follow
+    each other.
     """
     written = []
     places = {place: k for k, place in enumerate(asked.rows)}
     labels = [re.sub(r"[^\w.-]+", "_", track.name) or "person" for track in asked.tracks]
-    for k, rows in _rows(asked):
+    for k, rows in rows_by_track(asked):
         track, order = asked.tracks[k], [places[k, row] for row in rows]
         label = labels[k] if labels.count(labels[k]) == 1 else f"{labels[k]}_{k}"
         single = len(asked.file.tracks) == 1
         written.append("poses.npz" if single else f"poses_{label}.npz")
         follow = rows == list(range(rows[0], rows[0] + len(rows)))
+        shape, face = _apart(motion, order)
         write_poses(
             folder / written[-1],
             np.stack([done[at].pose for at in order]),
-            shape=None if motion.shape is None else motion.shape[order],
+            shape=shape,
+            expression=face,
             translation=None if motion.translation is None else motion.translation[order],
             names=[motion.names[at] for at in order],
             frame_rate=track.frame_rate if follow else None,
             gender=track.gender,
         )
     return written
+
+
+def _apart(motion: Motion, rows: list[int]) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Shape and expression of some frames."""
+    if motion.shape is None:
+        return None, None
+    own = motion.shape.shape[1] - motion.expressions
+    face = motion.shape[rows, own:] if motion.expressions else None
+    return motion.shape[rows, :own], face
 
 
 def write_like_input(

@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from spt_jax.cli.frames import Frame, Motion, as_report, made_from, tell, untangle_frames
-from spt_jax.cli.motions import Chosen, motion_of, write_motions
-from spt_jax.cli.terminal import err_console, progress_bar, show, user_errors
+from spt_jax.cli.motions import Chosen, write_motions
+from spt_jax.cli.posed import posed_on
+from spt_jax.cli.terminal import (
+    err_console,
+    progress_bar,
+    show,
+    user_errors,
+    warnings_as,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -80,11 +87,10 @@ def untangle_together(
         scenes = scenes_of(asked)
     with progress_bar(len(scenes.numbers), quiet) as state:
         state("loading the body")
-        from spt_jax.body import load_body
-
-        with user_errors():
-            model = load_body(body, num_shape=asked.num_shape, max_bytes=max_bytes)
-        motion, notes = motion_of(asked, model, body)
+        said: list[str] = []
+        with user_errors(), warnings_as(said):
+            model, motion, notes = posed_on(asked, body, max_bytes)
+        notes = said + notes
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
         whole = [_scene(model, motion, scenes, k) for k in range(len(scenes.numbers))]

@@ -142,7 +142,8 @@ def untangle(
     from spt_jax._exclusions import as_fold_distance
     from spt_jax._query import as_rays
     from spt_jax.cli.motion_frames import as_motions, pieces_of
-    from spt_jax.cli.motions import chosen, motion_of, write_like_input, write_motions
+    from spt_jax.cli.motions import chosen, write_like_input, write_motions
+    from spt_jax.cli.posed import posed_on
     from spt_jax.cli.together import untangle_together
     from spt_jax.files.outputs import ensure_folder, write_json
 
@@ -174,7 +175,6 @@ def untangle(
         )
     with progress_bar(len(asked.rows), quiet) as state:
         state("loading the body")
-        from spt_jax.body import load_body
         from spt_jax.cli.frames import (
             as_report,
             made_from,
@@ -187,8 +187,7 @@ def untangle(
 
         said: list[str] = []
         with user_errors(), warnings_as(said):
-            model = load_body(body, num_shape=asked.num_shape, max_bytes=max_bytes)
-        motion, notes = motion_of(asked, model, body)
+            model, motion, notes = posed_on(asked, body, max_bytes)
         notes = said + notes
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")

@@ -19,11 +19,14 @@ if TYPE_CHECKING:
     from spt_jax.body import BodyModel
     from spt_jax.datasets.items.inventory import Inventory
     from spt_jax.datasets.items.store import Store
+    from spt_jax.datasets.tracks import Posed
     from spt_jax.io.poses.track import MotionFile, Track
     from spt_jax.rest.surface import RestSurface
 
 # More shape components than AMASS and BEDLAM write, fewer than take long to load.
 _SHAPE_COMPONENTS = 16
+# As many as Motion-X writes, the most of all pose files.
+_EXPRESSIONS = 50
 
 
 @dataclass
@@ -62,11 +65,16 @@ class MeasureMotions:
     def start(self) -> None:
         """Load the body."""
         from spt_jax._exclusions import as_fold_surface
-        from spt_jax.body import load_body
+        from spt_jax.body import expression_as_shape, load_body
 
-        self.body_model: BodyModel = load_body(
-            self.body, num_shape=_SHAPE_COMPONENTS, max_bytes=self.max_bytes
+        body = load_body(
+            self.body,
+            num_shape=_SHAPE_COMPONENTS,
+            num_expression=_EXPRESSIONS,
+            max_bytes=self.max_bytes,
         )
+        self.expressions: int = body.num_expression
+        self.body_model: BodyModel = expression_as_shape(body)
         self.rest_surface: RestSurface = as_fold_surface(self.body_model, self.fold_distance)
 
     def work(self, path: Path, out: Path, report: Report) -> dict[str, Any]:
@@ -93,6 +101,13 @@ class MeasureMotions:
 
         return draw_worst(self, store, found.items, rows)
 
+    def posed(self, track: "Track", body: "BodyModel") -> "Posed":
+        """A track on the body, or on one made from it."""
+        from spt_jax.datasets.tracks import on_body
+
+        embedded = self.body == "anny"
+        return on_body(track, body, embedded=embedded, expressions=self.expressions)
+
     def _opened(self, path: Path) -> "MotionFile":
         try:
             return open_poses(path, max_bytes=self.max_bytes)
@@ -100,9 +115,9 @@ class MeasureMotions:
             raise UnknownFileError(str(error)) from error
 
     def _measured(self, track: "Track", done: int, total: int, report: Report) -> MotionOverlap:
-        from spt_jax.datasets.tracks import on_body, skins
+        from spt_jax.datasets.tracks import skins
 
-        posed = on_body(track, self.body_model, embedded=self.body == "anny")
+        posed = self.posed(track, self.body_model)
         faces = np.asarray(self.body_model.faces)
         pieces = []
         for vertices in skins(self.body_model, posed):
@@ -168,14 +183,13 @@ class CleanMotions(MeasureMotions):
         from spt_jax.datasets.tracks import (
             displacements,
             in_track,
-            on_body,
             second_differences,
         )
         from spt_jax.untangle.motion import MotionStep, untangle_motion
         from spt_jax.untangle.motion_input import up_of
 
         body = self._writable(track)
-        posed = on_body(track, body, embedded=self.body == "anny")
+        posed = self.posed(track, body)
         up = up_of(body, posed.pose)
 
         def on_step(step: MotionStep) -> None:
@@ -246,6 +260,7 @@ class CleanMotions(MeasureMotions):
                 out / f"{stem}{person}.npz",
                 poses[track.name],
                 shape=track.shape,
+                expression=track.expression,
                 translation=track.translation,
                 names=track.names,
                 frame_rate=track.frame_rate,

@@ -84,11 +84,11 @@ def _frame(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The vertices of one frame of a file, upright, and their labels."""
     from spt_jax import classify_vertices
-    from spt_jax.datasets.tracks import on_body, skins
+    from spt_jax.datasets.tracks import skins
     from spt_jax.io.poses.reading import open_poses
 
     track = open_poses(path, max_bytes=task.max_bytes).tracks[number]
-    posed = on_body(track, task.body_model, embedded=task.body == "anny")
+    posed = task.posed(track, task.body_model)
     pose = posed.pose[frame : frame + 1].copy()
     pose[:, 0] = 0.0
     one = posed._replace(

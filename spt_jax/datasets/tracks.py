@@ -21,6 +21,7 @@ class Posed(NamedTuple):
     Attributes:
         pose: axis-angle of each frame, in radians.
         shape: coefficients of each frame; the body's mean where the file has none that it takes.
+            Those of the expression are the last.
         translation: in metres; zero where the file has none.
         notes: what was left out.
     """
@@ -31,13 +32,14 @@ class Posed(NamedTuple):
     notes: tuple[str, ...]
 
 
-def on_body(track: Track, body: BodyModel, *, embedded: bool) -> Posed:
+def on_body(track: Track, body: BodyModel, *, embedded: bool, expressions: int) -> Posed:
     """A track on a body.
 
     Args:
         track: of a pose file.
         body: whose joints are found by name.
         embedded: whether it is the body of the package, whose shape components are not SMPL's.
+        expressions: how many of the body's shape components are expressions, the last ones.
     """
     notes = []
     layout = SMPL_LAYOUTS[track.pose.shape[1]]
@@ -54,10 +56,19 @@ def on_body(track: Track, body: BodyModel, *, embedded: bool) -> Posed:
         notes.append("shape is in SMPL's components; the embedded body's mean shape is taken")
     elif track.shape is not None:
         given = np.broadcast_to(track.shape, (count, track.shape.shape[-1]))
-        width = min(given.shape[1], body.num_shape)
+        own = body.num_shape - expressions
+        width = min(given.shape[1], own)
         shape[:, :width] = given[:, :width]
         if given[:, width:].any():
-            notes.append(f"shape components after the body's {body.num_shape} are left out")
+            notes.append(f"shape components after the body's {own} are left out")
+    face = track.expression
+    if face is not None:
+        width = min(face.shape[1], expressions)
+        first = body.num_shape - expressions
+        shape[:, first : first + width] = face[:, :width]
+        if face[:, width:].any():
+            what = f"expressions after the body's {expressions}" if expressions else "expressions"
+            notes.append(f"{what} are left out")
     place = np.zeros((count, 3)) if track.translation is None else track.translation
     pose = np.asarray(body.pose_from_smpl(track.pose.astype(np.float32)))
     return Posed(pose, shape, place.astype(np.float32), tuple(notes))

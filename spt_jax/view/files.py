@@ -154,6 +154,8 @@ def frames_for(given: Track, body: AbstractBody, *, embedded: bool) -> tuple[Fra
     elif shape is not None and shape.shape[-1] > body.num_shape:
         notes.append(f"Shape components after the body's {body.num_shape} are left out.")
         shape = shape[..., : body.num_shape]
+    if given.expression is not None and given.expression.any():
+        notes.append("The file's expressions are left out: the view has none.")
     if shape is not None:
         shape = np.broadcast_to(shape, (len(given.pose), shape.shape[-1]))
     layout = SMPL_LAYOUTS[given.pose.shape[1]]

@@ -10,7 +10,7 @@ from helpers_poses import MADE, as_matrix
 from test_cli import calls as calls  # the fixture
 from test_cli import files_in
 
-from spt_jax.body import load_body
+from spt_jax.body import expression_as_shape, load_body
 from spt_jax.cli.main import main
 from spt_jax.io.pose_files import MotionFile, load_poses, open_poses
 from spt_jax.view import files
@@ -138,7 +138,7 @@ def test_a_pickled_body_model_is_still_a_body(tmp_path, rng):
 
 
 def test_hand_components_drive_the_fingers_of_a_body_that_has_some(calls, tmp_path, capsys, rng):
-    smpl = synthetic_smpl(rng, 55, 30) | synthetic_hand(rng, ("l", "r"))
+    smpl = synthetic_smpl(rng, 55, 30, 20) | synthetic_hand(rng, ("l", "r"))
     smpl["hands_componentsl"] = smpl["hands_componentsl"][:6]  # fewer than the file has
     np.savez(tmp_path / "model.npz", **smpl)
     file = written(tmp_path, "smplifyx")
@@ -151,3 +151,22 @@ def test_hand_components_drive_the_fingers_of_a_body_that_has_some(calls, tmp_pa
     said = " ".join(capsys.readouterr().err.split())
     assert "the body has 6 components of the left hand, the file 12" in said
     assert "keeps the components of the right hand as they were" in said
+    # Ten of the file's components are expressions, and follow the shape.
+    face = load_poses(file)[0].expression
+    assert face is not None and face.any()
+    np.testing.assert_allclose(calls[0]["shape"][10:], face[0], rtol=1e-6)
+    (again,) = load_poses(tmp_path / "out" / "poses.npz")
+    assert again.shape is not None and again.expression is not None
+    np.testing.assert_allclose(again.expression, face, rtol=1e-6)
+    np.testing.assert_array_equal(again.shape[0], calls[0]["shape"][:10])
+    body = load_body(tmp_path / "model.npz")
+    one = body(calls[0]["pose"], again.shape[0], expression=again.expression[0]).vertices
+    both = expression_as_shape(body)(calls[0]["pose"], calls[0]["shape"]).vertices
+    np.testing.assert_allclose(one, both, atol=1e-5)
+
+
+def test_expressions_that_the_body_lacks_are_named(calls, tmp_path, capsys):
+    file = written(tmp_path, "smplifyx")
+    assert main(["untangle", str(file), "--out", str(tmp_path / "out"), "--rays", "16"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the body has no expressions: those of the file are left out" in said

@@ -40,11 +40,12 @@ def write_poses(
     names: Sequence[str] | None = None,
     frame_rate: float | None = None,
     gender: str | None = None,
+    expression: Float[Array | np.ndarray, "..."] | None = None,
 ) -> None:
     """Write poses as an .npz file in AMASS' layout, atomically; `load_poses` returns them as given.
 
     The keys are `poses` (N, 3 J), and where given `betas`, `trans` (N, 3), `mocap_framerate`,
-    `gender` and `name` (N,).
+    `gender`, `expression` (N, E) and `name` (N,).
 
     Args:
         path: the file; its suffix must be .npz.
@@ -54,6 +55,7 @@ def write_poses(
         names: one for each frame.
         frame_rate: frames a second.
         gender: "male", "female" or "neutral".
+        expression: coefficients of the face, (E,) or (N, E).
 
     Raises:
         ValueError: another suffix, or what `load_poses` would not accept.
@@ -73,7 +75,13 @@ def write_poses(
     file = Path(path)
     if file.suffix.lower() != ".npz":
         raise ValueError(f"path must end in .npz: got {str(path)!r}")
-    given = {"poses": pose, "betas": shape, "trans": translation, "mocap_framerate": frame_rate}
+    given = {
+        "poses": pose,
+        "betas": shape,
+        "trans": translation,
+        "mocap_framerate": frame_rate,
+        "expression": expression,
+    }
     arrays = {key: np.asarray(value) for key, value in given.items() if value is not None}
     texts = {"gender": gender, "name": names}
     arrays |= {k: np.asarray(v, dtype=np.str_) for k, v in texts.items() if v is not None}
