@@ -14,7 +14,7 @@ import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap, self_intersection_penalty
-from spt_jax.xla.settings import DEFAULT_RAYS, Xla, bytes_needed, room
+from spt_jax.xla.settings import DEFAULT_RAYS, Xla, buffer_sizes, bytes_needed
 
 # Overlaps smaller than this, in m^3, are left out where differences are parts of the volume.
 _LEAST = 1e-6
@@ -110,7 +110,7 @@ def price(settings: Settings) -> Table:
             taken.append(1e3 * (time.perf_counter() - start))
         return float(np.median(taken))
 
-    space = room(Xla(), DEFAULT_RAYS)
+    space = buffer_sizes(Xla(), DEFAULT_RAYS)
     bound = bytes_needed(space, len(batch[0]), len(body.faces), 4)
     rows = [
         ("one body, ms", f"{milliseconds(one, batch[0]):.1f}"),

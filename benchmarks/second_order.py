@@ -16,7 +16,7 @@ import tyro
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import config, load_body, load_mocap, self_intersection_penalty
-from spt_jax.bridge.callback import forget
+from spt_jax.bridge.callback import clear_results
 from spt_jax.overlap.host_curvature import curvatures
 
 _STEP = 1e-9  # of the differences, in metres for a velocity of about one
@@ -55,7 +55,7 @@ def _colliding(body: Any, settings: Settings) -> np.ndarray:
 
 
 def _timed(function: Any, *arguments: Any) -> float:
-    forget()
+    clear_results()
     curvatures.clear()
     start = time.process_time()
     jax.block_until_ready(function(*arguments))

@@ -43,7 +43,7 @@ def milliseconds(
     times = []
     for _ in range(repeats):
         if not again:
-            callback.forget()
+            callback.clear_results()
         start = time.perf_counter()
         jax.block_until_ready(call())
         times.append(1e3 * (time.perf_counter() - start))
@@ -73,7 +73,7 @@ def main(settings: Settings) -> None:
         jax.vmap(jax.value_and_grad(lambda v: self_intersection_penalty(v, body.faces)))
     )
     for _ in range(8):  # until batches have been worth another process, and that is there
-        callback.forget()
+        callback.clear_results()
         jax.block_until_ready(default(batch))
         time.sleep(1.0)
     kinds = {

@@ -63,7 +63,7 @@ def timed(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, np.
         task = bar.add_task("calls", total=(repeats + 1) * len(calls))
         for turn in range(repeats + 1):
             for name, call in calls.items():
-                callback.forget()
+                callback.clear_results()
                 start = time.perf_counter()
                 jax.block_until_ready(call())
                 if turn:
@@ -148,7 +148,7 @@ def end_to_end(repeats: int) -> tuple[Table, list[Metric]]:
         return found.volume, found.gradient("boundary", "vertex")
 
     for _ in range(8):  # until batches have been worth another process, and that is there
-        callback.forget()
+        callback.clear_results()
         jax.block_until_ready(many(batch))
         time.sleep(1.0)
     times = timed(

@@ -128,7 +128,7 @@ def test_a_volume_below_rounding_is_zero_and_has_no_gradient(monkeypatch, volume
     monkeypatch.setattr(host_functions, "measure", lambda *_: Found())
     value, gradient = jax.value_and_grad(loss)(as_jax(PAIR, "float32") + 0.3)
     assert value == 0 and not np.signbit(value) and not np.abs(gradient).any()
-    callback.forget()
+    callback.clear_results()
 
 
 @pytest.mark.parametrize("rays", [None, (64, 64)])

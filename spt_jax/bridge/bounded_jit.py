@@ -27,7 +27,7 @@ class BoundedJit:
     def __init__(self, function: Callable[..., Any], most: int = _MOST):
         self._function, self._most = function, most
         self._lock = threading.Lock()
-        self._forget()
+        self._reset()
 
     def __call__(self, static: Any, *arrays: Any) -> Any:
         """The function of its arguments."""
@@ -37,7 +37,7 @@ class BoundedJit:
             kind = static, structure, *((leaf.shape, leaf.dtype) for leaf in leaves)
             with self._lock:
                 if kind not in self._seen and len(self._seen) >= self._most:
-                    self._forget()
+                    self._reset()
                 self._seen.add(kind)
         return self._jitted(static, *arrays)
 
@@ -47,9 +47,9 @@ class BoundedJit:
     def clear(self) -> None:
         """Forget all programs."""
         with self._lock:
-            self._forget()
+            self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         function = self._function
 
         @functools.wraps(function)

@@ -104,9 +104,9 @@ def call_on_host(
     return tuple(array.reshape(batch + array.shape[1:]) for array in found)
 
 
-def forget() -> None:
+def clear_results() -> None:
     """Forget what was measured, for those who time it."""
-    on_host.forget()
+    on_host.clear_results()
 
 
 def is_local(array: Any) -> bool:

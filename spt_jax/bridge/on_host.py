@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from spt_jax.bridge.process_pool import Workers, usable_cores
-from spt_jax.bridge.result_cache import Recent
+from spt_jax.bridge.result_cache import ResultCache
 
 # function(vertices, faces, options) -> one array per result; NumPy alone, never raises.
 HostFunction = Callable[[np.ndarray, np.ndarray, Any], tuple[np.ndarray, ...]]
@@ -66,9 +66,9 @@ def measured(work: Work, vertices: np.ndarray, faces: np.ndarray) -> list[np.nda
 
 
 def _stacked(work: Work, vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
-    known = [_recent.faces(one) for one in faces]
+    known = [_result_cache.faces(one) for one in faces]
     meshes = list(zip(map(_as_xla_has_them, vertices), itertools.cycle(known), strict=False))
-    found = _recent.results(work, meshes, functools.partial(_measured_anew, work))
+    found = _result_cache.results(work, meshes, functools.partial(_measured_anew, work))
     return [
         np.array([one[k] for one in found], dtype).reshape(len(vertices), *shape)
         for k, (shape, dtype) in enumerate(work.results)
@@ -102,26 +102,26 @@ def executor() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(usable_cores(), thread_name_prefix="spt_jax")
 
 
-_recent = Recent()
+_result_cache = ResultCache()
 _workers = Workers()
 
 
-def forget() -> None:
+def clear_results() -> None:
     """Forget what was measured."""
-    _recent.forget()
+    _result_cache.clear()
 
 
 def release() -> None:
     """Give back what is kept between calls: results, other processes and threads."""
-    _recent.forget_all()
+    _result_cache.clear_all()
     _workers.release()
 
 
 def _begin_anew() -> None:
-    global _recent
+    global _result_cache
     # A forked child inherits the executor but not its threads, and locks as they are.
     executor.cache_clear()
-    _recent = Recent()
+    _result_cache = ResultCache()
     _workers.leave_to_parent()
 
 

@@ -1,4 +1,4 @@
-"""One other process of the same Python that measures meshes, and what it is told.
+"""Another process of the same Python that measures meshes, and the orders it takes.
 
 It is started by command line, not forked: a fork of a process with threads, as JAX has, may hang;
 and not through `multiprocessing`, which runs the user's main script again. It ends when its
@@ -33,13 +33,13 @@ Mesh = tuple[np.ndarray, np.ndarray]
 # not asked until then. Starting it, and unpacking a rest surface, take seconds on a busy machine.
 _GIVEN_UP = 60.0
 
-# Seconds that are spent on telling it what its work is.
-_TOLD = 0.1
+# Seconds spent on sending it an order at most.
+_ORDERING = 0.1
 
 _numbers = itertools.count()
 
-# How many functions with their options a worker remembers.
-_REMEMBERED = 8
+# How many functions with their options a worker keeps.
+_MOST_KEPT = 8
 
 # What a worker's allocator keeps for itself: glibc gives arrays of some 100 kB back to the system
 # and asks for them anew, a page fault for every 4 kB. Two processes are 1.65 times as fast as one
@@ -97,7 +97,7 @@ class Worker:
         self._number = 0
 
     def is_ready(self, work: bytes) -> bool:
-        """Whether it can measure now; if only for want of knowing the work, it is told.
+        """Whether it can measure now; if only the work is unknown to it, it is sent.
 
         Raises:
             LostError: it is gone, or has not answered for a minute.
@@ -113,11 +113,11 @@ class Worker:
             self._known.move_to_end(work)
             return True
         try:
-            if len(self._known) == _REMEMBERED:
-                self._ask(_TOLD, "forget", self._known.popitem(last=False)[1])
+            if len(self._known) == _MOST_KEPT:
+                self._ask(_ORDERING, "evict", self._known.popitem(last=False)[1])
             # Options may take a second to unpack, such as the distances of a rest surface.
             self._known[work] = self._number + 1
-            self._ask(_TOLD, "learn", self._number + 1, work)
+            self._ask(_ORDERING, "register", self._number + 1, work)
         except TimeoutError:
             pass  # the rest is sent when it takes more
         return False
@@ -180,10 +180,10 @@ def serve(descriptor: int, parent: int) -> None:
     works: dict[int, tuple[Function, Any]] = {}
     known_faces = np.zeros((0, 3), np.int64)
 
-    def forget(number):
+    def evict(number):
         del works[number]
 
-    def learn(number, work):
+    def register(number, work):
         works[number] = pickle.loads(work)
 
     def measure(number, vertices, faces):
@@ -194,7 +194,7 @@ def serve(descriptor: int, parent: int) -> None:
         with np.errstate(all="ignore"):
             return function(vertices, known_faces, options)
 
-    orders = {"forget": forget, "learn": learn, "measure": measure}
+    orders = {"evict": evict, "register": register, "measure": measure}
     try:
         frames.send(0, (True, None), _GIVEN_UP)
         while True:
@@ -214,7 +214,7 @@ def serve(descriptor: int, parent: int) -> None:
         os._exit(0)  # at once: nothing here needs to be wound up
 
 
-@functools.lru_cache(maxsize=_REMEMBERED)
+@functools.lru_cache(maxsize=_MOST_KEPT)
 def packed(function: Function, options: Hashable) -> bytes | None:
     """A function with its options as bytes; None where another process could not find it."""
     if not function.__module__.startswith("spt_jax."):

@@ -139,12 +139,12 @@ def _left(store: Store, items: Sequence[Item], retry: bool, verify: bool) -> lis
         if row is not None and retry and row["status"] == "failed":
             with store.claim(item.name) as taken:
                 if taken:
-                    store.forget(item.name)
+                    store.discard(item.name)
             row = None
         if row is None or not is_whole(store, row, item):
             left.append(item)
         elif verify and not store.verified(row):
-            store.forget(item.name)
+            store.discard(item.name)
             left.append(item)
     return left
 

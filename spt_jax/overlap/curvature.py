@@ -61,9 +61,9 @@ class Curvature:
     def _moving(self, layer: Layer) -> _Moving:
         surface, shares = self._surface, layer.shares
         faces = surface.manifold.faces
-        crossings = surface.crossings.only(layer.counts)
+        intersections = surface.intersections.only(layer.counts)
         contours = MovingContours(
-            surface.points, surface.topology, crossings, layer.contours, surface.reach
+            surface.points, surface.topology, intersections, layer.contours, surface.reach
         )
         corners = faces[shares.faces]
         a, b, c = surface.points[corners].transpose(1, 0, 2)
@@ -116,7 +116,7 @@ class Curvature:
         Args:
             moving, judged: the overlaps.
             velocity: of the vertices.
-            rates: of the crossings.
+            rates: of the intersections.
             volume: how fast each region's volume changes.
         """
         mixed = (judged.share > 0) & (judged.share < 1)

@@ -1,4 +1,4 @@
-"""How much of a surface's overlap counts: volume, gradient and labels, exactly."""
+"""The included overlap of a surface: volume, gradient and labels, exactly."""
 
 from functools import cached_property
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from spt_jax.overlap.vectors import summed
 
 
 class Judged(NamedTuple):
-    """Overlaps that count with a share of their contour.
+    """Overlap regions that are included with a share, which their contours decide.
 
     Attributes:
         layer: these overlaps.
@@ -23,7 +23,7 @@ class Judged(NamedTuple):
         at: the region of each of its segments.
         volume: of each region.
         length: of each region's contour.
-        share: what part of that length counts; 1 of a region without a contour.
+        share: the part of that length that is included; 1 for a region without a contour.
     """
 
     layer: Layer
@@ -35,11 +35,11 @@ class Judged(NamedTuple):
 
 
 class ExactOverlap:
-    """What of a surface's overlap counts: volume, gradient and labels.
+    """The included overlap of a surface: volume, gradient and labels.
 
     Args:
         surface: the surface.
-        exclusions: what does not count.
+        exclusions: what is excluded.
     """
 
     def __init__(self, surface: ExactSurface, exclusions: Exclusions = NOTHING):
@@ -54,7 +54,7 @@ class ExactOverlap:
 
     @property
     def layers(self) -> list[Layer]:
-        """The overlaps that count whole, and where something is left out those that are judged."""
+        """The overlaps included whole and, with exclusions, those that contours decide."""
         return self._layers
 
     @property
@@ -63,7 +63,7 @@ class ExactOverlap:
 
     @cached_property
     def pair_weights(self) -> Float[np.ndarray, "P"]:
-        """How much each of the surface's contours counts as a collision."""
+        """The weight of each of the surface's contours: 1 for a collision, 0 for a fold."""
         weight = np.zeros(len(self.surface.pairs))
         weight[self._whole.segments] = 1.0
         for layer in self._layers[1:]:
@@ -76,7 +76,7 @@ class ExactOverlap:
 
     @cached_property
     def judged(self) -> Judged | None:
-        """The overlaps that count with a share of their contour; None where nothing is left out."""
+        """The regions that contours decide; None without exclusions."""
         if len(self._layers) < 2:
             return None
         layer, surface = self._layers[1], self.surface
@@ -94,15 +94,15 @@ class ExactOverlap:
 
     @property
     def volume(self) -> float:
-        """The overlap volume that counts."""
+        """The included overlap volume."""
         return max(self.signed_volume, 0.0)
 
     @cached_property
     def signed_volume(self) -> float:
-        """The sums that the volume is made of.
+        """The sum from which the volume is taken.
 
-        They fall below zero by rounding, or where a part that a fan turned inside out (w = -1) is
-        left out as a fold and another part overlaps it: then only the product of the two is left.
+        It falls below zero by rounding, or where a part that a fan turned inside out (w = -1) is
+        excluded as a fold and another part overlaps it: then only their common overlap remains.
         """
         surface, shares, total = self.surface, self._whole.shares, 0.0
         if len(shares.faces):
@@ -124,10 +124,10 @@ class ExactOverlap:
         return surface.manifold.gather(total, surface.count)
 
     def _judged_gradient(self, judged: Judged) -> Float[np.ndarray, "X 3"]:
-        """Of sum of s V over the regions: s dV, and V ds where a part of the contour counts.
+        """The gradient of the sum of s V over the regions: s dV, and V ds where 0 < s < 1.
 
-        With L the segments' lengths, 1 or 0 the weights k of those that count, and T the sum of L,
-        s is the sum of k L over T, and ds the sum of (k - s) / T dL.
+        With L the segments' lengths, k their weights (1 for a collision, 0 for a fold) and T the
+        sum of L, s is the sum of k L over T, and ds the sum of (k - s) / T dL.
         """
         surface, layer, share = self.surface, judged.layer, judged.share
         faces, count = surface.manifold.faces, len(surface.points)
@@ -136,17 +136,17 @@ class ExactOverlap:
         if mixed.any():
             at, weight = judged.at[mixed], self.pair_weights[layer.segments][mixed]
             rate = judged.volume[at] * (weight - share[at]) / judged.length[at]
-            crossings = surface.crossings.only(layer.counts)
+            intersections = surface.intersections.only(layer.counts)
             contours = layer.contours.only(mixed)
-            vertex, force = length_gradient(surface.points, faces, crossings, contours, rate)
+            vertex, force = length_gradient(surface.points, faces, intersections, contours, rate)
             total += summed(vertex, force, count)
         return total
 
     @cached_property
     def winding(self) -> Int[np.ndarray, "V"]:
-        """w_out around each vertex given, 0 where its overlap does not count.
+        """w_out around each vertex given, 0 where its overlap is excluded.
 
-        A vertex at which several sheets meet takes the number nearest to zero of them all.
+        A vertex at which several sheets meet takes the number that is nearest to zero.
         """
         surface, judged = self.surface, self.judged
         found = surface.labels(self._whole, self._exclusions)
@@ -166,13 +166,13 @@ class ExactOverlap:
 
     @property
     def intersecting_pairs(self) -> int:
-        """Pairs of the triangles given that intersect and count."""
+        """How many pairs of the triangles given intersect and are included."""
         return self.surface.count_pairs((self.pair_weights > 0) & self.surface.listed)
 
     def areas(
         self,
     ) -> tuple[Int[np.ndarray, "H"], Int[np.ndarray, "H 3"], Float[np.ndarray, "H"]]:
-        """Faces given that bound overlaps which count, w_out at their corners, and its mean."""
+        """Faces given that bound included overlaps, w_out at their corners, and its mean."""
         manifold, parts = self.surface.manifold, []
         for layer in self._layers:
             faces = layer.shares.faces

@@ -1,20 +1,20 @@
-"""Which overlaps count: pairs of groups left out, and folds told from collisions.
+"""Which overlaps are included: ignored pairs of groups and folds at joints are excluded.
 
-Between two connected parts of the surface an overlap counts or not as a whole, where their groups
-say so, and always where no path along the rest surface connects them: such overlaps are measured by
-winding numbers of the parts that count, exactly. Parts that lie in each other at rest, as eyeballs
-in a head, are meant to, and do not count.
+Overlap between two connected parts of the surface is included or excluded as a whole, where the
+parts' groups decide it or where no path along the rest surface connects the parts. Such overlap is
+measured exactly, by the winding numbers of the included parts. Parts that lie in each other at
+rest, such as eyeballs in a head, are meant to overlap and are excluded.
 
-Within one part the intersection contours decide. A region of overlap counts with the share of its
-contour's length along which the intersecting triangles are far from each other at rest: wholly
-where all of it is, as for two limbs; not at all where none is, as for the crease of a bent elbow;
-and in part where a fold and a collision hang together. Where a hole was closed by a fan, what the
-fan meets beside the hole is a fold, too, whatever else counts (`caps.py`).
+Within one part the intersection contours decide. An overlap region is included with the share of
+its contour's length along which the intersecting triangles are far from each other at rest: wholly
+where all of the contour is, as for two limbs; not at all where none is, as for the crease of a bent
+elbow; and in part where a fold and a collision form one region. Where a fan closes a hole, what the
+fan intersects beside the hole is a fold, too, whatever else is included (`caps.py`).
 
-Rays that were asked for tell intervals one by one: an interval in a region that counts does so
-where its four sheets may collide: the two solids that overlap there either cross or lie one in the
-other, and every end of one must be apart from every end of the other. Intervals at triangles which
-collide at the contour count too, so that a region that counts never weighs nothing.
+With rays, each interval is decided by itself. An interval in an included region is included where
+its four sheets may collide: the two solids that overlap there either cross each other or lie one in
+the other, and every end of one must be apart from every end of the other. Intervals that end at a
+triangle which collides at a contour are included too, so that no included region has volume zero.
 """
 
 import functools
@@ -56,11 +56,11 @@ class Rest(Protocol):
 
 
 class Exclusions(NamedTuple):
-    """What does not count, hashable so that it can be a static option.
+    """What is excluded, hashable so that it can be a static option.
 
     Attributes:
         groups: each triangle's group, the bytes of an int64 array; None: no groups.
-        ignored: pairs of groups whose overlaps do not count.
+        ignored: pairs of groups whose overlaps are excluded.
         rest: overlaps of sheets nearer than `rest.distance` along it are folds; None: none are.
     """
 
@@ -70,7 +70,7 @@ class Exclusions(NamedTuple):
 
     @property
     def any(self) -> bool:
-        """Whether anything is left out."""
+        """Whether anything is excluded."""
         return bool(self.groups is not None and self.ignored) or self.rest is not None
 
 
@@ -79,7 +79,7 @@ NOTHING = Exclusions()
 
 @dataclass(frozen=True, eq=False)
 class PartRules:
-    """Which overlaps between two connected parts count, and which the contour has to judge.
+    """Which overlaps between two connected parts are included, and which the contour decides.
 
     Attributes:
         group: of each part, as a row of the table of ignored pairs; -1 where it has several.
@@ -98,7 +98,7 @@ class PartRules:
     def __call__(
         self, first: Int[np.ndarray, "N"], second: Int[np.ndarray, "N"]
     ) -> Bool[np.ndarray, "N 2"]:
-        """Whether overlaps of two parts count whole, and whether the contour judges them."""
+        """Whether overlaps of two parts are included whole, and whether the contour decides."""
         same = first == second
         judged = (self.group[first] < 0) | (self.group[second] < 0)
         dropped = ~judged & self.ignored[self.group[first], self.group[second]]
@@ -135,7 +135,7 @@ def part_rules(exclusions: Exclusions, manifold: Manifold) -> PartRules:
 def pair_weights(
     exclusions: Exclusions, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N"]:
-    """How much an intersection of two faces counts as a collision: 1, or 0 for a fold."""
+    """The weight of an intersection of two faces: 1 for a collision, 0 for a fold."""
     weight = 1.0 - _ignored(exclusions, f, g)
     if exclusions.rest is not None:
         weight *= ~exclusions.rest.near(f, g, exact=True)
@@ -143,53 +143,53 @@ def pair_weights(
 
 
 @dataclass(frozen=True)
-class Rims:
-    """For intervals on rays: the regions of overlap, and what their contours say.
+class ContourDecisions:
+    """The overlap regions and what their contours decide of them, for intervals on rays.
 
     Attributes:
         region: of each face given; -1 where it bounds none.
         pairs: faces that intersect.
         collides: which of these pairs collide.
-        may_count: regions that have a collision along their contour, or no contour.
+        included: regions that have a collision along their contour, or no contour.
     """
 
     region: Int[np.ndarray, "F"]
     pairs: Int[np.ndarray, "P 2"]
     collides: Bool[np.ndarray, "P"]
-    may_count: Bool[np.ndarray, "R"]
+    included: Bool[np.ndarray, "R"]
 
 
-def judged_rims(
+def decide_by_contours(
     exclusions: Exclusions,
     region: Int[np.ndarray, "F"],
     count: int,
     pairs: Int[np.ndarray, "P 2"],
-) -> Rims:
-    """Which intersections of faces collide, and what that makes of the regions."""
+) -> ContourDecisions:
+    """Which intersections of faces are collisions, and which regions are included for that."""
     collides = pair_weights(exclusions, *pairs.T) > 0
     at = region[pairs[:, 0]]
     total = np.bincount(at, minlength=count)
-    return Rims(
+    return ContourDecisions(
         region, pairs, collides, (total == 0) | (np.bincount(at[collides], minlength=count) > 0)
     )
 
 
-def counted_intervals(
-    exclusions: Exclusions, rims: Rims, beams: list[Overlaps]
+def included_intervals(
+    exclusions: Exclusions, decisions: ContourDecisions, beams: list[Overlaps]
 ) -> list[Bool[np.ndarray, "N"]]:
-    """Which intervals of each beam count."""
-    allowed = np.append(rims.may_count, True)  # -1: in no region
-    collides = np.zeros(len(rims.region), bool)
-    collides[rims.pairs[rims.collides]] = True
-    # With folds excluded, an interval counts if either of its end faces lies on a colliding
+    """Which intervals of each beam are included."""
+    allowed = np.append(decisions.included, True)  # -1: in no region
+    collides = np.zeros(len(decisions.region), bool)
+    collides[decisions.pairs[decisions.collides]] = True
+    # With folds excluded, an interval is included if either of its end faces lies on a colliding
     # contour. With groups, both must: accepting one would attribute 6 % of each body's own overlap
     # to the pair, requiring both leaves 0.2 %.
-    at_rim = np.any if exclusions.rest is not None else np.all
+    at_contour = np.any if exclusions.rest is not None else np.all
     counted = []
     for overlaps in beams:
-        region = rims.region[overlaps.ends].max(axis=1, initial=-1)
-        rim = at_rim(collides[overlaps.ends], axis=1)
-        counted.append(allowed[region] & (rim | _apart(exclusions, overlaps)))
+        region = decisions.region[overlaps.ends].max(axis=1, initial=-1)
+        near_contour = at_contour(collides[overlaps.ends], axis=1)
+        counted.append(allowed[region] & (near_contour | _apart(exclusions, overlaps)))
     return counted
 
 
@@ -220,7 +220,7 @@ def _apart(exclusions: Exclusions, overlaps: Overlaps) -> Bool[np.ndarray, "N"]:
     apart = far["of"] & far["cl"] & np.where(crossing, far["oc"] & far["fl"], far["ol"] & far["fc"])
     apart = np.where(lone, far["fl"], apart)
     # Where several solids overlap in a row, the nearest sheet that opens or closes may be another
-    # solid's. So of two that cross, the sheets that bound the interval tell the pair of groups.
+    # solid's. So of two that cross, the sheets that bound the interval determine the groups.
     ignored = {name: _ignored(exclusions, *pair) for name, pair in pairs.items()}
     nested = ignored["of"] | ignored["cl"] | ignored["ol"] | ignored["fc"]
     return apart & ~np.where(crossing | lone, ignored["fl"], nested)

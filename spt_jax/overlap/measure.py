@@ -11,7 +11,13 @@ from spt_jax.overlap.boundary import boundary_gradient, vertex_gradient
 from spt_jax.overlap.caps import Closed, Hole, closed_surface, holes_of, open_sheets
 from spt_jax.overlap.curvature import Curvature
 from spt_jax.overlap.exact import ExactOverlap
-from spt_jax.overlap.exclusions import NOTHING, Exclusions, Rims, counted_intervals, judged_rims
+from spt_jax.overlap.exclusions import (
+    NOTHING,
+    ContourDecisions,
+    Exclusions,
+    decide_by_contours,
+    included_intervals,
+)
 from spt_jax.overlap.labels import add_labels_without_rays, triangle_labels
 from spt_jax.overlap.rays.beam import Beam, Rays, aim
 from spt_jax.overlap.rays.crossings import cast
@@ -52,8 +58,8 @@ class Probe:
 
     Attributes:
         beam: the rays.
-        overlaps: the overlaps that count.
-        everything: those and the ones that are left out.
+        overlaps: the overlaps that are included.
+        everything: all overlaps.
         crossings: of rays with triangles.
     """
 
@@ -69,7 +75,7 @@ class Probe:
 
     @property
     def total_volume(self) -> float:
-        """The same of all overlaps, those counted that are left out."""
+        """The same with all overlaps, the excluded ones too."""
         return self.everything.size * self.beam.ray_area
 
 
@@ -80,7 +86,7 @@ class Measurement:
     Attributes:
         vertices, faces: the mesh.
         sampling: how it is measured.
-        exclusions: what does not count.
+        exclusions: what is excluded.
         rounding: machine epsilon of the numbers that the vertices came in.
     """
 
@@ -120,19 +126,19 @@ class Measurement:
 
     @cached_property
     def overlap(self) -> ExactOverlap:
-        """What counts, from the triangles alone."""
+        """The included overlap, from the triangles alone."""
         return ExactOverlap(self.surface, self.exclusions)
 
     @cached_property
     def everything(self) -> ExactOverlap:
-        """The same with what does not count."""
+        """All overlap, excluded or not."""
         if not self.exclusions.any:
             return self.overlap
         return ExactOverlap(self.surface)
 
     @cached_property
     def curvature(self) -> Curvature:
-        """Second derivatives of the volume that counts, where it is exact."""
+        """Second derivatives of the included volume, where it is exact."""
         return Curvature(self.overlap)
 
     @property
@@ -153,7 +159,7 @@ class Measurement:
                 for probe in found
                 for all_ in [probe.everything]
             ]
-            counted = counted_intervals(self.exclusions, self._rims, named)
+            counted = included_intervals(self.exclusions, self._contour_decisions, named)
             found = [
                 replace(probe, overlaps=probe.everything.only(kept))
                 for probe, kept in zip(found, counted, strict=True)
@@ -169,23 +175,23 @@ class Measurement:
         return Probe(beam, overlaps, overlaps, crossings.met)
 
     @property
-    def _rims(self) -> Rims:
+    def _contour_decisions(self) -> ContourDecisions:
         (layer,) = self.surface.layers(None)
         region, count = regions_of(self.surface, layer)
         of_face = np.full(len(self.faces), -1)
         of_face[self.surface.manifold.beside[layer.shares.faces]] = region
-        return judged_rims(self.exclusions, of_face, count, self.surface.pairs)
+        return decide_by_contours(self.exclusions, of_face, count, self.surface.pairs)
 
     @property
     def volumes(self) -> list[float]:
-        """The overlap volume that counts, as each beam sees it."""
+        """The included overlap volume, as each beam measures it."""
         if self.exact:
             return [self.overlap.volume] * len(self.sampling.directions)
         return [found.volume for found in self.beams]
 
     @property
     def volume(self) -> float:
-        """The overlap volume that counts: exact, or the mean of the beams' own."""
+        """The included overlap volume: exact, or the mean over the beams."""
         return float(np.mean(self.volumes))
 
     @property
@@ -247,13 +253,13 @@ def measure(
     exclusions: Exclusions = NOTHING,
     rounding: float = float(np.finfo(np.float64).eps),
 ) -> Measurement:
-    """A mesh measured; what costs time beyond its intersections is done when it is asked for.
+    """Measure a mesh; beyond its intersections, each quantity is computed when it is first read.
 
     Args:
         vertices: positions, in any unit.
         faces: indices of each triangle's corners.
         sampling: exactly or by rays.
-        exclusions: what does not count.
+        exclusions: what is excluded.
         rounding: machine epsilon of the numbers that the vertices came in.
 
     Raises:

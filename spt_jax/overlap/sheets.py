@@ -6,7 +6,7 @@ overlap. A triangle's part of it is bounded by pieces of its sides and by the se
 solids' triangles pass through it. With n the triangle's unit normal it is the sum over these pieces
 p to q of w n . (p x q) / 2 (w on the left of the piece), and every end is a corner or a place where
 an edge passes through a triangle. So the derivative is a force q x n or n x p, times w / 2, on each
-end, which `force_on_crossings` hands on to the edge and the triangle that make it.
+end, which `force_on_intersections` hands on to the edge and the triangle that make it.
 
 How deep: of each vertex inside, the distance to the nearest triangle of a solid, times a third of
 the area of the triangles around it, summed up. It is zero where the area inside is, but for
@@ -24,7 +24,7 @@ from spt_jax.overlap.depth import nearest_points
 from spt_jax.overlap.measure import Unmeasurable, check_usable
 from spt_jax.overlap.surface import ExactSurface
 from spt_jax.overlap.triangles.closed_form import sides_of
-from spt_jax.overlap.triangles.contours import force_on_crossings, senses
+from spt_jax.overlap.triangles.contours import force_on_intersections, senses
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.triangles.near_triangles import Entangled
 from spt_jax.overlap.triangles.winding import winding_numbers
@@ -84,8 +84,8 @@ class SheetInSolids:
     def _counts(self) -> Bool[np.ndarray, "K"]:
         surface = self.surface
         part, faces = surface.manifold.part, surface.manifold.faces
-        first = part[surface.crossings.edge[:, 0]]
-        return self._counted(first, part[faces[surface.crossings.face, 0]])[:, 0]
+        first = part[surface.intersections.edge[:, 0]]
+        return self._counted(first, part[faces[surface.intersections.face, 0]])[:, 0]
 
     @cached_property
     def _ends(self):
@@ -94,7 +94,7 @@ class SheetInSolids:
             surface.topology,
             surface.manifold,
             surface.predicates,
-            surface.crossings,
+            surface.intersections,
             surface.contours,
             self._counts[:, None],
             self._counted,
@@ -133,16 +133,16 @@ class SheetInSolids:
         face = np.repeat(found, 3)
         start, end = faces[found].ravel(), np.roll(faces[found], -1, axis=1).ravel()
         pieces = [(face, points[start], points[end], winding[start], start, end)]
-        crossings = replace(
-            surface.crossings, jump=np.where(self._counts, surface.crossings.jump, 0)
+        intersections = replace(
+            surface.intersections, jump=np.where(self._counts, surface.intersections.jump, 0)
         )
-        number, half = sides_of(surface.topology, crossings)
-        mine = own[half // 3] & (crossings.jump[number] != 0)
+        number, half = sides_of(surface.topology, intersections)
+        mine = own[half // 3] & (intersections.jump[number] != 0)
         number, half = number[mine], half[mine]
         last = faces[half // 3, (half + 2) % 3]
-        jump = crossings.jump[number] * senses(surface.topology, half)
+        jump = intersections.jump[number] * senses(surface.topology, half)
         at = -1 - number  # a place, not a vertex
-        pieces.append((half // 3, crossings.point[number], points[last], jump, at, last))
+        pieces.append((half // 3, intersections.point[number], points[last], jump, at, last))
         for k, sense in ((0, 1), (1, -1)):
             contours = surface.contours
             rows = np.flatnonzero(own[contours.pair[:, k]] & ~self._sheets(contours.pair[:, 1 - k]))
@@ -166,8 +166,8 @@ class SheetInSolids:
             [half_w * cross(end, normal[face]), half_w * cross(normal[face], start)]
         )
         total = summed(places[places >= 0], force[places >= 0], len(points))
-        passing = summed(-1 - places[places < 0], force[places < 0], len(crossings.face))
-        vertex, passed = force_on_crossings(points, faces, crossings, passing)
+        passing = summed(-1 - places[places < 0], force[places < 0], len(intersections.face))
+        vertex, passed = force_on_intersections(points, faces, intersections, passing)
         total += summed(vertex, passed, len(points))
         return value / scale**2, manifold.gather(total / scale, len(self.vertices))
 

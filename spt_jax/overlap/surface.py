@@ -19,7 +19,7 @@ from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours, find_contours
 from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
 from spt_jax.overlap.triangles.pair_layout import Topology, prepared
-from spt_jax.overlap.triangles.pairs import EdgeCrossings, find_intersections
+from spt_jax.overlap.triangles.pairs import EdgeIntersections, find_intersections
 from spt_jax.overlap.triangles.predicates import Predicates
 from spt_jax.overlap.triangles.regions import connected_regions
 from spt_jax.overlap.triangles.winding import Ends, enclosing_parts, labels_of, winding_numbers
@@ -37,9 +37,9 @@ class Layer:
     Attributes:
         ends: the winding numbers, of which this layer has the column `column`.
         column: of the layer.
-        counts: which crossings belong to it.
+        counts: which intersections belong to it.
         contours: the segments that do.
-        crossings: as in the surface, of which the contours' ends are rows.
+        intersections: as in the surface, of which the contours' ends are rows.
         shares: the triangles' contributions.
         dropped: triangles of overlaps that are there by rounding alone.
     """
@@ -62,7 +62,7 @@ class ExactSurface:
         manifold: the surface closed and cut into sheets.
         scale: coordinates are multiplied by this, a power of two.
         points: the new vertices' scaled positions.
-        crossings, contours: where the surface meets itself.
+        intersections, contours: where the surface meets itself.
         reach: how near things are that touch, of the scaled positions.
         proper: which of the contours' pairs intersect, and do not only touch.
 
@@ -92,11 +92,11 @@ class ExactSurface:
         self.points = np.ascontiguousarray(self.predicates.points.T)
         self.topology: Topology = prepared(self._faces, len(placed)).topology
         self.reach = _CONTACT * rounding
-        self.crossings: EdgeCrossings
-        self.crossings, self._find_contacts = find_intersections(
+        self.intersections: EdgeIntersections
+        self.intersections, self._find_contacts = find_intersections(
             self.points, self._faces, predicates=self.predicates, reach=self.reach
         )
-        self.contours = find_contours(self.points, self.topology, self.crossings)
+        self.contours = find_contours(self.points, self.topology, self.intersections)
 
     def _merge(self, first: Int[np.ndarray, "P"], sense: Int[np.ndarray, "P"]) -> None:
         """Measure each of these parts for all that lie in its place.
@@ -196,14 +196,14 @@ class ExactSurface:
                 return np.ones((len(first), 1), bool)
             return rules(first, second)
 
-        first, second = part[self.crossings.edge[:, 0]], part[faces[self.crossings.face, 0]]
+        first, second = part[self.intersections.edge[:, 0]], part[faces[self.intersections.face, 0]]
         counts = counted(first, second)
         of_pairs = counted(*part[faces[self.contours.pair, 0]].T)
         ends = winding_numbers(
             self.topology,
             self.manifold,
             self.predicates,
-            self.crossings,
+            self.intersections,
             self.contours,
             counts,
             counted,
@@ -213,7 +213,7 @@ class ExactSurface:
         for column in range(counts.shape[1]):
             on, segments = counts[:, column], of_pairs[:, column]
             every = bool(on.all())
-            crossings = self.crossings if every else self.crossings.only(on)
+            intersections = self.intersections if every else self.intersections.only(on)
             contours = self.contours
             if not every:
                 number = np.cumsum(on) - 1
@@ -221,7 +221,7 @@ class ExactSurface:
                 end = np.where(contours.end >= 0, number[contours.end], -1)
                 contours = _with_ends(contours, end)
             shares = shares_of(
-                self.points, self.topology, crossings, contours, ends, column, self.times
+                self.points, self.topology, intersections, contours, ends, column, self.times
             )
             layer = Layer(ends, column, on, contours, segments, shares)
             found.append(self._without_contact(layer))

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.vectors import area_normals
 
 # Sine below which an edge runs along the face that it crosses: the contour would run away.
@@ -14,7 +14,9 @@ _SATURATION = 0.2
 
 
 def contour_forces(
-    faces: Int[np.ndarray, "F 3"], vertices: Float[np.ndarray, "V 3"], crossings: EdgeCrossings
+    faces: Int[np.ndarray, "F 3"],
+    vertices: Float[np.ndarray, "V 3"],
+    intersections: EdgeIntersections,
 ) -> Float[np.ndarray, "V 3"]:
     """Forces along which the intersection contour gets shorter, until it vanishes.
 
@@ -28,18 +30,18 @@ def contour_forces(
     Args:
         faces: the triangles, none of which lists a vertex twice.
         vertices: positions.
-        crossings: of edges through faces.
+        intersections: of edges through faces.
 
     Returns:
         The sum of the forces at each vertex, without unit.
     """
-    tail, head = crossings.edge.T
+    tail, head = intersections.edge.T
     normal = unit(area_normals(vertices, faces))
-    across = normal[crossings.face]
+    across = normal[intersections.face]
     edge = vertices[head] - vertices[tail]
     along = unit(edge)
     bend = np.zeros(along.shape)
-    for face in crossings.edge_faces.T:
+    for face in intersections.edge_faces.T:
         onward = unit(np.cross(normal[face], across))
         # Into the face: towards its middle, as seen from its edge.
         middle = vertices[faces[face]].mean(axis=1) - vertices[tail]
@@ -51,10 +53,10 @@ def contour_forces(
     force /= np.sqrt(dot(force, force) + _SATURATION**2)
 
     length = np.maximum(np.linalg.norm(edge, axis=1), np.finfo(float).tiny)
-    part = np.linalg.norm(crossings.point - vertices[tail], axis=1) / length
+    part = np.linalg.norm(intersections.point - vertices[tail], axis=1) / length
     part = np.clip(part, 0.0, 1.0)[:, None]
-    corners = faces[crossings.face]
-    weights = _barycentric(vertices[corners], crossings.point)
+    corners = faces[intersections.face]
+    weights = _barycentric(vertices[corners], intersections.point)
     total = np.zeros(vertices.shape)
     np.add.at(total, tail, (1.0 - part) * force)
     np.add.at(total, head, part * force)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax._steps import OnStep, Step
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
-from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.spread import Spread, Surface
@@ -77,7 +77,8 @@ class Place:
     Attributes:
         vertices: at values that the dtype asked for can hold.
         found: what was measured of them, exactly.
-        crossings: of edges through triangles that are to go; in the numbering of `found.surface`.
+        intersections: of edges through triangles that are to go; in the numbering of
+            `found.surface`.
         left: pairs of triangles that are to go. More than those that count as intersecting: in
             single precision, also those that are deeper in each other than rounding alone explains.
         inverted: connected parts whose volume changed its sign.
@@ -85,7 +86,7 @@ class Place:
 
     vertices: Float[np.ndarray, "V 3"]
     found: Measurement
-    crossings: EdgeCrossings
+    intersections: EdgeIntersections
     left: int
     inverted: int
 
@@ -119,10 +120,10 @@ class Place:
 
     @property
     def ends(self) -> tuple[Int[np.ndarray, "K 2"], Int[np.ndarray, "K 3"]]:
-        """Of the crossings the edges and the triangles, by the vertices given."""
+        """Of the intersections the edges and the triangles, by the vertices given."""
         manifold = self.found.surface.manifold
-        corners = manifold.faces[self.crossings.face]
-        return manifold.origin[self.crossings.edge], manifold.origin[corners]
+        corners = manifold.faces[self.intersections.face]
+        return manifold.origin[self.intersections.edge], manifold.origin[corners]
 
 
 @dataclass(frozen=True)
@@ -268,13 +269,13 @@ class _Search:
         close &= ~np.isin(self._keys(pairs), self._touching)
         wanted = listed & (surface.proper | close)
         ends = surface.contours.end[wanted]
-        kept = np.zeros(len(surface.crossings.face), bool)
+        kept = np.zeros(len(surface.intersections.face), bool)
         kept[ends[ends >= 0]] = True
         turned = self.surface.part_senses(found.vertices) * self._sense < 0
         return Place(
             found.vertices,
             found,
-            surface.crossings.only(kept),
+            surface.intersections.only(kept),
             int(np.count_nonzero(wanted)),
             int(np.count_nonzero(turned)),
         )
@@ -308,11 +309,11 @@ class _Search:
         return found.gradient("boundary", "vertex")
 
     def groups(self, place: Place, also: Bool[np.ndarray, "V"]) -> list[Int[np.ndarray, "_"]]:
-        """Vertices at crossings and others that hang together with them, by edge or crossing."""
+        """Vertices at intersections, with others they are connected to by edge or intersection."""
         edge, corners = place.ends
         found = self.surface.groups(place.crossed | also, edge[:, 0], corners[:, 0])
-        # A part that lies within another whole has overlap, but nothing that crosses: pushing
-        # its surface inwards would shrink it to nothing.
+        # A part that is enclosed in another overlaps it but intersects nothing: pushing its surface
+        # inwards would shrink it to nothing.
         return [members for members in found if place.crossed[members].any()]
 
     def regions(self) -> list[_Region]:
@@ -390,7 +391,7 @@ class _Search:
         """The displacement of one step."""
         push, vertices = self.push(place), place.vertices
         manifold = place.found.surface.manifold
-        contour = contour_forces(manifold.faces, place.found.surface.points, place.crossings)
+        contour = contour_forces(manifold.faces, place.found.surface.points, place.intersections)
         contour = manifold.gather(contour, len(vertices))
         pushed, pulled = [], []
         for members in self.groups(place, (push != 0).any(axis=1)):

@@ -80,10 +80,10 @@ def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience:
     return server
 
 
-def forget_what_was_removed(server: Any) -> None:
-    """Have viser drop its notes of what is gone, which it does only when a browser comes.
+def drop_removed_nodes(server: Any) -> None:
+    """Have viser drop its records of removed nodes, which it does only when a browser connects.
 
-    Every file that is opened leaves ten of them.
+    Every file that is opened leaves ten such records.
     """
     server._run_garbage_collector()
 

@@ -17,8 +17,8 @@ from spt_jax.view.access import access_for, free_port
 from spt_jax.view.freeing import untangle_scene
 from spt_jax.view.guarded import (
     PATIENCE,
+    drop_removed_nodes,
     drop_who_does_not_read,
-    forget_what_was_removed,
     start_guarded,
     stop_quietly,
 )
@@ -258,7 +258,7 @@ class View:
             raise ValueError(reading.error)
         self.scene, self._motions = scene, motions
         self._status = "ready" if start is None else motions[start[0]].names[start[1]]
-        forget_what_was_removed(self.server)
+        drop_removed_nodes(self.server)
         self._stage.begin(scene, reading)
         self.panel = Panel(self.server, scene, motions, start, self._do)
         self._stage.set_handles(scene, self.panel.joints, self._turned)

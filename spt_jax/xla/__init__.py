@@ -23,7 +23,7 @@ What differs:
 - An interval counts or is left out as a whole. Where three solids overlap and one of their pairs is
   left out, which of the other pairs go with it depends on the order in which rays meet them.
 - More than 16,000 parts (at 512 rays) over one another, or a row of the screen with more crossings
-  than there is room for, give NaN, and `usage.device_usage` tells.
+  than the buffers hold, give NaN, and `usage.device_usage` reports it.
 
 What it costs. All arrays have fixed sizes (`settings.Xla`); the screen is worked off in strips of
 rows that fit, one direction and, on a CPU, one mesh after the other; `settings.bytes_needed` is an

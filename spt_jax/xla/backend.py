@@ -89,7 +89,7 @@ def _penalty_of_one(vertices, faces, task: Task):
     if len(faces) == 0:
         return jnp.where(usable, nothing[0], jnp.nan), nothing[1]
     by_class = value == "ratio" or gradient not in (None, "boundary")
-    wants = Wants(value == "volume", gradient == "boundary", by_class and _rays_tell(task))
+    wants = Wants(value == "volume", gradient == "boundary", by_class and _rays_decide_labels(task))
     found, fits = _cast(clean, faces, task, wants)
     usable, result, slope = usable & fits, found.volume, found.gradient
     if by_class:
@@ -109,7 +109,7 @@ def _labels_of_one(vertices, faces, task: Task):
     usable, clean, faces = _cleaned(vertices, faces)
     if len(faces) == 0:
         return jnp.zeros(len(vertices), jnp.int32)
-    found, fits = _cast(clean, faces, task, Wants(labels=_rays_tell(task)))
+    found, fits = _cast(clean, faces, task, Wants(labels=_rays_decide_labels(task)))
     label = _labels(clean, faces, task, found.codes)
     return jnp.where(usable & fits, label, 0)
 
@@ -118,13 +118,13 @@ def _usage_of_one(vertices, faces, task: Task):
     _, clean, faces = _cleaned(vertices, faces)
     if len(faces) == 0:
         return no_usage()
-    return _cast_all(clean, faces, task._replace(tables=task.tables._replace(judge=None)), Wants())[
-        1
-    ]
+    return _cast_all(
+        clean, faces, task._replace(tables=task.tables._replace(exclusions=None)), Wants()
+    )[1]
 
 
-def _rays_tell(task: Task) -> bool:
-    return task.program.rule == "triangle" or task.tables.judge is not None
+def _rays_decide_labels(task: Task) -> bool:
+    return task.program.rule == "triangle" or task.tables.exclusions is not None
 
 
 def _cast(clean, faces, task: Task, wants: Wants):
@@ -137,7 +137,7 @@ def _cast(clean, faces, task: Task, wants: Wants):
 def _cast_all(clean, faces, task: Task, wants: Wants):
     program, tables = task
     return cast_beams(
-        clean, faces, program.rays, tables.aims, program.settings, wants, tables.judge
+        clean, faces, program.rays, tables.aims, program.settings, wants, tables.exclusions
     )
 
 
@@ -145,7 +145,7 @@ def _labels(clean, faces, task: Task, codes: Int[Array, "V"]):
     if task.program.rule == "triangle":
         return as_labels(codes)
     label = vertex_labels(clean, faces, jnp.asarray(task.tables.frames))
-    if task.tables.judge is None:
+    if task.tables.exclusions is None:
         return label
     # A connected patch counts whole or not at all.
     return jnp.where(spread(codes > 0, label != 0, faces), label, 0)

@@ -1,4 +1,4 @@
-"""Which overlaps count, decided for each interval by its own sheets, as `overlap.exclusions`."""
+"""Which overlaps are included, decided interval by interval, as in `overlap.exclusions`."""
 
 from typing import NamedTuple
 
@@ -7,79 +7,82 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.overlap.exclusions import UNCONNECTED
 from spt_jax.xla.levels import Intervals
-from spt_jax.xla.pair_search import over_crossing_pairs
+from spt_jax.xla.pair_search import over_intersecting_pairs
 from spt_jax.xla.patches import spread
-from spt_jax.xla.tables import GroupTable, Judge, PathTable, PlaceTable, RestTable
+from spt_jax.xla.tables import ExclusionTables, GroupTable, PathTable, PlaceTable, RestTable
 
 # The six pairs of the four sheets: opening, first, last and closing, along the ray.
 _PAIRS = {"ol": (0, 2), "fc": (1, 3), "oc": (0, 3), "fl": (1, 2), "of": (0, 1), "cl": (3, 2)}
 
 
-class Rims(NamedTuple):
-    """Triangles that pass through another one; the rims of overlaps run there.
+class ContourFaces(NamedTuple):
+    """Triangles that pass through another one; the contour_faces of overlaps run there.
 
     Attributes:
-        crossing: all of them.
+        intersecting: all of them.
         colliding: those that collide there.
     """
 
-    crossing: Bool[Array, "F"]
+    intersecting: Bool[Array, "F"]
     colliding: Bool[Array, "F"]
 
-    def may_count(self, faces: Int[Array, "F 3"], overlapped: Bool[Array, "V"]) -> Bool[Array, "V"]:
-        """The vertices of overlaps that have a collision along their rim, or no rim."""
+    def included(self, faces: Int[Array, "F 3"], overlapped: Bool[Array, "V"]) -> Bool[Array, "V"]:
+        """The vertices of overlaps that have a collision along their contour, or no contour."""
 
         def reached(triangles):
             corners = jnp.zeros(len(overlapped), bool)
             corners = corners.at[faces.reshape(-1)].max(jnp.repeat(triangles, 3))
             return spread(corners, overlapped, faces)
 
-        return reached(self.colliding) | (overlapped & ~reached(self.crossing))
+        return reached(self.colliding) | (overlapped & ~reached(self.intersecting))
 
 
-def find_rims(judge: Judge, vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Rims:
-    """The rims of all overlaps, from the triangles alone.
+def find_contour_faces(
+    exclusions: ExclusionTables, vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]
+) -> ContourFaces:
+    """The contour_faces of all overlaps, from the triangles alone.
 
     Two triangles that pass through each other collide where they are far apart at rest, and of
     groups of which overlaps count.
     """
 
-    def add(rims: Rims, first, second, crosses) -> Rims:
-        collides = crosses & ~_by_groups(judge.groups, first, second)[1]
-        if judge.rest is not None:
-            collides &= ~_near_at_rest(judge.rest, first, second)
+    def add(contour_faces: ContourFaces, first, second, intersects) -> ContourFaces:
+        collides = intersects & ~_by_groups(exclusions.groups, first, second)[1]
+        if exclusions.rest is not None:
+            collides &= ~_near_at_rest(exclusions.rest, first, second)
         both = jnp.concatenate([first, second])
-        return Rims(
-            rims.crossing.at[both].max(jnp.tile(crosses, 2)),
-            rims.colliding.at[both].max(jnp.tile(collides, 2)),
+        return ContourFaces(
+            contour_faces.intersecting.at[both].max(jnp.tile(intersects, 2)),
+            contour_faces.colliding.at[both].max(jnp.tile(collides, 2)),
         )
 
     nothing = jnp.zeros(len(faces), bool)
-    return over_crossing_pairs(vertices, faces, add, Rims(nothing, nothing))
+    return over_intersecting_pairs(vertices, faces, add, ContourFaces(nothing, nothing))
 
 
-def which_count(
-    judge: Judge,
+def included_intervals(
+    exclusions: ExclusionTables,
     intervals: Intervals,
     faces: Int[Array, "F 3"],
-    rims: Rims,
-    may_count: Bool[Array, "V"],
+    contour_faces: ContourFaces,
+    included: Bool[Array, "V"],
 ) -> Bool[Array, "N"]:
-    """Which intervals count.
+    """Which intervals are included.
 
-    Of overlaps that may count, those whose sheets may collide and those at triangles that collide
-    at the rim.
+    Of the included overlaps, those whose sheets may collide and those that end at a triangle which
+    collides at a contour.
     """
-    apart = _apart(judge, intervals)
+    apart = _apart(exclusions, intervals)
     # Two sheets bound an overlap: what is known of either holds for what is between them.
     corners = faces[intervals.ends.reshape(-1)]
-    allowed = may_count[corners].all(axis=1).reshape(-1, 2).any(axis=1)
-    # As on the host: one end at the rim will do where folds are told apart, groups ask for both.
-    at_rim = jnp.any if judge.rest is not None else jnp.all
-    return allowed & (apart | at_rim(rims.colliding[intervals.ends], axis=1))
+    allowed = included[corners].all(axis=1).reshape(-1, 2).any(axis=1)
+    # As on the host: one end at a colliding contour is enough where folds are excluded; groups
+    # require both.
+    at_contour = jnp.any if exclusions.rest is not None else jnp.all
+    return allowed & (apart | at_contour(contour_faces.colliding[intervals.ends], axis=1))
 
 
-def _apart(judge: Judge, intervals: Intervals) -> Bool[Array, "N"]:
+def _apart(exclusions: ExclusionTables, intervals: Intervals) -> Bool[Array, "N"]:
     """Whether the two solids of each interval may collide."""
     first, last = intervals.ends.T
     opening, closing = intervals.around.T
@@ -90,19 +93,20 @@ def _apart(judge: Judge, intervals: Intervals) -> Bool[Array, "N"]:
     length, far, ignored = {}, {}, {}
     for name, (i, j) in _PAIRS.items():
         pair = sheets[i], sheets[j]
-        other_group, ignored[name] = _by_groups(judge.groups, *pair)
+        other_group, ignored[name] = _by_groups(exclusions.groups, *pair)
         length[name] = other_group.astype(jnp.float32)
         far[name] = jnp.ones(len(first), bool)
-        if judge.rest is not None:
-            along = _along_rest(judge.rest.paths, *pair)
-            far[name] = ~_folds(judge.rest.places, *pair, along)
+        if exclusions.rest is not None:
+            along = _along_rest(exclusions.rest.paths, *pair)
+            far[name] = ~_folds(exclusions.rest.places, *pair, along)
             length[name] = length[name] + jnp.minimum(along, UNCONNECTED)
     crossing = length["ol"] + length["fc"] <= length["oc"] + length["fl"]
     apart = far["of"] & far["cl"]
     apart &= jnp.where(crossing, far["oc"] & far["fl"], far["ol"] & far["fc"])
     apart = jnp.where(lone, far["fl"], apart)
     # Where several solids overlap in a row, the nearest sheet that opens or closes may be another
-    # solid's. So of two that cross, the sheets that bound the interval tell the pair of groups.
+    # solid's. So of two that cross, the sheets that bound the interval determine the pair of
+    # groups.
     nested = ignored["of"] | ignored["cl"] | ignored["ol"] | ignored["fc"]
     return apart & ~jnp.where(crossing | lone, ignored["fl"], nested)
 
@@ -133,8 +137,8 @@ def _along_rest(table: PathTable, f: Int[Array, "N"], g: Int[Array, "N"]) -> Flo
 def _near_at_rest(rest: RestTable, f: Int[Array, "N"], g: Int[Array, "N"]) -> Bool[Array, "N"]:
     """`RestSurface.near`, by the bounds over all seeds.
 
-    Of 9,157 pairs of triangles that cross on 60 mocap frames none is told otherwise than by the
-    paths themselves; by the bounds of `_along_rest` 36 are.
+    Of 9,157 pairs of triangles that intersect on 60 mocap frames none is classified otherwise than
+    by the paths themselves; by the bounds of `_along_rest` 36 are.
     """
     table = rest.paths
     faces = table.nearest.shape[0]

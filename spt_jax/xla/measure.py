@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.xla.beam import Aims
-from spt_jax.xla.exclusions import Judge, find_rims, which_count
+from spt_jax.xla.exclusions import ExclusionTables, find_contour_faces, included_intervals
 from spt_jax.xla.gradient import add_codes, boundary_gradient
 from spt_jax.xla.levels import Intervals, kept_only
 from spt_jax.xla.settings import Xla
@@ -53,7 +53,7 @@ def cast_beams(
     aimed: Aims,
     settings: Xla,
     wants: Wants,
-    judge: Judge | None = None,
+    exclusions: ExclusionTables | None = None,
 ) -> tuple[Found, Usage, Bool[Array, ""]]:
     """Every beam of the sampling through one mesh; twice where something does not count.
 
@@ -61,20 +61,26 @@ def cast_beams(
         vertices, faces: finite, and in range.
         rays: how many.
         aimed: their directions.
-        settings: of the room.
+        settings: sizes of the buffers.
         wants: what to find.
-        judge: tells what does not count; None: everything does.
+        exclusions: which overlaps are excluded; None: none are.
 
     Returns:
         What was found, what it took, and whether all of it was measured: where it was not, nothing
         of it can be used.
     """
     counted = None
-    if judge is not None:
-        rims = find_rims(judge, vertices, faces)
+    if exclusions is not None:
+        contour_faces = find_contour_faces(exclusions, vertices, faces)
         overlapped = _overlapped(vertices, faces, rays, aimed, settings)
-        may_count = rims.may_count(faces, overlapped)
-        counted = functools.partial(which_count, judge, faces=faces, rims=rims, may_count=may_count)
+        included = contour_faces.included(faces, overlapped)
+        counted = functools.partial(
+            included_intervals,
+            exclusions,
+            faces=faces,
+            contour_faces=contour_faces,
+            included=included,
+        )
 
     def add(found: Found, intervals: Intervals, ray: Ray) -> Found:
         if counted is not None:

@@ -1,4 +1,4 @@
-"""All pairs of triangles that pass through each other, of arrays whose sizes are known.
+"""All pairs of triangles that intersect, with arrays of fixed sizes.
 
 Triangles are put in the order of a Morton curve through their centers, and every 16 of them make a
 cluster with a box. Clusters are tested against all clusters, 128 of them at once; pairs of clusters
@@ -15,11 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax.xla.arrays import cumulative_sum, take
-from spt_jax.xla.triangle_pairs import cross_each_other
+from spt_jax.xla.triangle_pairs import triangles_intersect
 
 CLUSTER = 16
-# Clusters, pairs of clusters, of triangles and of those that cross that are worked on at once.
-_ROWS, _CLUSTER_PAIRS, _PAIRS, _CROSSING = 128, 1024, 1 << 14, 256
+# Clusters, pairs of clusters, of triangles and of intersecting ones that are worked on at once.
+_ROWS, _CLUSTER_PAIRS, _PAIRS, _INTERSECTING = 128, 1024, 1 << 14, 256
 # Of the curve: bits of each coordinate.
 _BITS = 10
 
@@ -31,18 +31,18 @@ class Boxes(NamedTuple):
     high: Float[Array, "*N 3"]
 
 
-def over_crossing_pairs(
+def over_intersecting_pairs(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
     add: Callable[[Any, Int[Array, "P"], Int[Array, "P"], Bool[Array, "P"]], Any],
     sums: Any,
 ) -> Any:
-    """`sums = add(sums, first, second, crosses)` for all pairs that pass through each other.
+    """`sums = add(sums, first, second, intersects)` for all pairs that intersect.
 
     Args:
         vertices, faces: finite, and in range.
-        add: given some hundreds of pairs, and which of them pass through each other; every pair
-            that does comes once.
+        add: given some hundreds of pairs, and which of them intersect; every pair that does is
+            given once.
         sums: what `add` begins with.
     """
     face, boxes = _in_order(vertices, faces)
@@ -71,12 +71,12 @@ def over_crossing_pairs(
                 pair, at = index // CLUSTER**2, index % CLUSTER**2
                 f = take(face, take(first, pair))[jnp.arange(len(at)), at // CLUSTER]
                 g = take(face, take(second, pair))[jnp.arange(len(at)), at % CLUSTER]
-                crosses = cross_each_other(vertices, take(faces, f), take(faces, g))
+                intersects = triangles_intersect(vertices, take(faces, f), take(faces, g))
 
-                def some_crossing(sums, index, used):
+                def some_intersecting(sums, index, used):
                     return add(sums, take(f, index), take(g, index), used)
 
-                return _over_true(crosses & used, _CROSSING, some_crossing, sums)
+                return _over_true(intersects & used, _INTERSECTING, some_intersecting, sums)
 
             return _over_true(meet.reshape(-1), _PAIRS, some_triangles, sums)
 

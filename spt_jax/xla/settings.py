@@ -20,9 +20,9 @@ _FEWEST_CROSSINGS, _FEWEST_SORTED = 1 << 14, 1 << 13
 class Xla(NamedTuple):
     """Settings of `backend="xla"`, which stands for `Xla()`.
 
-    The screen is worked off in strips of rows that fit; a strip that would need more room is made
-    lower, so that these numbers decide speed and memory and not the result. Only a single row that
-    does not fit makes the value NaN (`device_usage` tells).
+    The screen is processed in strips of rows that fit; a strip that would need larger buffers is
+    made lower, so these numbers decide speed and memory and not the result. Only a single row that
+    does not fit makes the value NaN (`device_usage` reports it).
 
     Attributes:
         segments: rows of triangles in a strip; None: half as many as crossings.
@@ -38,7 +38,7 @@ class Xla(NamedTuple):
     meshes_at_once: int | None = None
 
 
-class Room(NamedTuple):
+class BufferSizes(NamedTuple):
     """Sizes of the arrays of one mesh and direction."""
 
     rows: int
@@ -48,12 +48,12 @@ class Room(NamedTuple):
     sorted: int
 
 
-def known(rays: Rays) -> int | tuple[int, int]:
-    """The number of rays, where None was given too."""
+def resolve_rays(rays: Rays) -> int | tuple[int, int]:
+    """The number of rays, with None replaced by the default."""
     return DEFAULT_RAYS if rays is None else rays
 
 
-def bytes_needed(space: Room, num_vertices: int, num_faces: int, itemsize: int) -> int:
+def bytes_needed(space: BufferSizes, num_vertices: int, num_faces: int, itemsize: int) -> int:
     """An upper bound of the memory that one mesh takes: half as much again as XLA's own figure.
 
     With R x C pixels, S segments, N crossings, M of them sorted, and w bytes a number:
@@ -76,12 +76,12 @@ def meshes_at_once(settings: Xla, rays: Rays, vertices: Any, faces: Any) -> int:
         return settings.meshes_at_once
     if jax.default_backend() == "cpu":
         return 1  # a core has enough to do with one
-    space = room(settings, rays)
+    space = buffer_sizes(settings, rays)
     each = bytes_needed(space, vertices.shape[1], faces.shape[1], vertices.dtype.itemsize)
     return max(1, min(len(vertices), _MOST_BYTES // each))
 
 
-def room(settings: Xla, rays: Rays) -> Room:
+def buffer_sizes(settings: Xla, rays: Rays) -> BufferSizes:
     """The sizes, from static numbers alone.
 
     Raises:
@@ -92,7 +92,7 @@ def room(settings: Xla, rays: Rays) -> Room:
             raise ValueError(
                 f"{name} must be a positive whole number or None: got {value!r} in {settings}."
             )
-    rays = known(rays)
+    rays = resolve_rays(rays)
     rows, columns = most_pixels(rays)
     height, width = rays if isinstance(rays, tuple) else (rays, rays)
     crossings = settings.crossings or max(height * width, _FEWEST_CROSSINGS)
@@ -107,4 +107,4 @@ def room(settings: Xla, rays: Rays) -> Room:
     chosen = settings.sorted or max(crossings // 4, _FEWEST_SORTED)
     if chosen > 2**24:
         raise ValueError(f"sorted must be at most {2**24}: got {chosen}; take fewer.")
-    return Room(rows, columns, segments, crossings, chosen + chosen % 2)
+    return BufferSizes(rows, columns, segments, crossings, chosen + chosen % 2)

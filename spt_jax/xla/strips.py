@@ -19,13 +19,13 @@ from spt_jax.xla.crossings import (
     cut_into_segments,
 )
 from spt_jax.xla.levels import Intervals, find_overlaps, most_levels, thickness
-from spt_jax.xla.settings import Room, Xla, known, room
+from spt_jax.xla.settings import BufferSizes, Xla, buffer_sizes, resolve_rays
 
 Sums = TypeVar("Sums")
 
 
 class Usage(NamedTuple):
-    """What the fullest beam needed of the room that there is.
+    """How much of its buffers the fullest beam needed.
 
     Attributes:
         segments, crossings, sorted: of the fullest row of the screen. A row that needs more than
@@ -77,15 +77,15 @@ def over_strips(
         vertices, faces: finite, and in range.
         rays: how many.
         aimed: their directions.
-        settings: of the room.
+        settings: sizes of the buffers.
         add: gives the sums with a strip's intervals.
         sums: before any of them.
 
     Returns:
-        The sums, what of the room was used, and whether all of the rays had room.
+        The sums, the usage of the buffers, and whether all rays fitted.
     """
-    rays = known(rays)
-    space = room(settings, rays)
+    rays = resolve_rays(rays)
+    space = buffer_sizes(settings, rays)
     directions = jnp.asarray(aimed.direction)
 
     def along(state, one: Aims):
@@ -117,7 +117,7 @@ def _strip(
     screen: Screen,
     rows: Rows,
     faces: Int[Array, "F 3"],
-    space: Room,
+    space: BufferSizes,
     begin: Int[Array, ""],
     num_rows: Int[Array, ""],
     usage: Usage,

@@ -34,7 +34,7 @@ from spt_jax.overlap.exclusions import Exclusions, group_table
 from spt_jax.overlap.measure import Sampling
 from spt_jax.rest.paths import SurfacePaths
 from spt_jax.xla.beam import Aims, aims
-from spt_jax.xla.settings import known
+from spt_jax.xla.settings import resolve_rays
 from spt_jax.xla.winding import generic_frames
 
 # Known, before they become operands.
@@ -94,7 +94,7 @@ class RestTable(NamedTuple):
     places: PlaceTable
 
 
-class Judge(NamedTuple):
+class ExclusionTables(NamedTuple):
     """What tells which overlaps do not count."""
 
     groups: GroupTable | None
@@ -107,17 +107,17 @@ class Tables(NamedTuple):
     Attributes:
         aims: the directions of the rays.
         frames: of the rays through vertices, as `winding.generic_frames`.
-        judge: None where everything counts.
+        exclusions: None where everything counts.
     """
 
     aims: Aims
     frames: Float[_Values, "D 3 3"]
-    judge: Judge | None
+    exclusions: ExclusionTables | None
 
 
 def tables_of(sampling: Sampling, exclusions: Exclusions, dtype: np.dtype) -> Tables:
     """The arrays for one sampling, in the precision of the vertices."""
-    aimed = aims(sampling._replace(rays=known(sampling.rays)), dtype)
+    aimed = aims(sampling._replace(rays=resolve_rays(sampling.rays)), dtype)
     frames = generic_frames(sampling.directions).astype(dtype)
     if not exclusions.any:
         return Tables(aimed, frames, None)
@@ -126,7 +126,7 @@ def tables_of(sampling: Sampling, exclusions: Exclusions, dtype: np.dtype) -> Ta
         groups = _group_table(exclusions)
     if exclusions.rest is not None:
         rest = rest_table(exclusions.rest)
-    return Tables(aimed, frames, Judge(groups, rest))
+    return Tables(aimed, frames, ExclusionTables(groups, rest))
 
 
 def rest_table(rest: Any) -> RestTable:

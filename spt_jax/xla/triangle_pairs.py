@@ -1,15 +1,15 @@
-"""Whether two triangles pass through each other."""
+"""Whether two triangles intersect."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
-def cross_each_other(
+def triangles_intersect(
     vertices: Float[Array, "V 3"], first: Int[Array, "N 3"], second: Int[Array, "N 3"]
 ) -> Bool[Array, "N"]:
-    """Whether an edge of one goes through the other, pair by pair; contact is no crossing.
+    """Whether an edge of one passes through the other, pair by pair; contact is no intersection.
 
-    Nor does an edge go through a triangle with which it shares a vertex.
+    An edge does not pass through a triangle with which it shares a vertex.
     """
     first_corners, second_corners = vertices[first], vertices[second]
     same = first[:, :, None] == second[:, None, :]

@@ -10,7 +10,7 @@ from spt_jax.bridge.bounded_jit import BoundedJit
 from spt_jax.overlap.measure import Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.xla.backend import Program, Task, as_task, usage_on_device
-from spt_jax.xla.settings import Room, Xla, room
+from spt_jax.xla.settings import BufferSizes, Xla, buffer_sizes
 from spt_jax.xla.strips import Usage
 
 
@@ -21,7 +21,7 @@ def device_usage(
     rays: Rays = None,
     directions: Any = 3,
     settings: Xla | None = None,
-) -> tuple[Usage, Room]:
+) -> tuple[Usage, BufferSizes]:
     """What `backend="xla"` needs of its arrays for these meshes, and what it has.
 
     Args:
@@ -29,8 +29,8 @@ def device_usage(
         settings: as passed for its `backend`; None: as for "xla".
 
     Returns:
-        The need of each mesh, and the room. Where the need of `segments`, `crossings` or `sorted`,
-        each of the fullest row of the screen, is more than the room, the penalty is NaN.
+        What each mesh needs, and the buffer sizes. Where the fullest row of the screen needs more
+        `segments`, `crossings` or `sorted` than there are, the penalty is NaN.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`.
@@ -49,7 +49,9 @@ def device_usage(
     vertices, faces = as_mesh(vertices, faces)
     program = Program(settings or Xla(), as_rays(rays))
     task = as_task(program, Sampling(program.rays, as_directions(directions)), vertices.dtype)
-    return _usage(program, vertices, faces, task.tables), room(program.settings, program.rays)
+    return _usage(program, vertices, faces, task.tables), buffer_sizes(
+        program.settings, program.rays
+    )
 
 
 def _usage_of(program, vertices, faces, tables):

@@ -100,11 +100,11 @@ def test_new_values_of_every_option_keep_a_bounded_number_of_things(rng):
         classify_vertices(vertices, faces, rest_surface=rest)
     gc.collect()
     assert len(kept) <= 16
-    recent = on_host._recent
-    assert len(recent._asked) <= 8 and len(recent._faces) <= 4 and len(recent._results) <= 8
+    cache = on_host._result_cache
+    assert len(cache._queries) <= 8 and len(cache._faces) <= 4 and len(cache._results) <= 8
     clear_caches()
     assert len(kept) <= 1  # the last one is this function's own
-    assert not recent._results and not recent._faces and len(manifold._manifolds) == 0
+    assert not cache._results and not cache._faces and len(manifold._manifolds) == 0
 
 
 def test_compiled_programs_are_given_back_too():

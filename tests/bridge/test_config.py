@@ -12,7 +12,7 @@ from helpers import join, sphere
 from spt_jax import config, self_intersection_penalty
 from spt_jax._settings import Config
 from spt_jax.bridge import process_pool
-from spt_jax.bridge.result_cache import Recent
+from spt_jax.bridge.result_cache import ResultCache
 from spt_jax.overlap.host_functions import value_on_host
 
 MESH = join(sphere(), sphere(center=(1.1, 0.2, 0.1)))
@@ -56,19 +56,19 @@ def test_wrong_settings_are_refused_and_change_nothing(wrong, untyped):
 
 
 def test_results_are_kept_as_far_as_the_setting_goes(monkeypatch):
-    recent, calls = Recent(), []
+    cache, calls = ResultCache(), []
 
     def measured(meshes):
         calls.append(len(meshes))
         return [(np.zeros(3),) for _ in meshes]
 
-    faces = recent.faces(MESH[1])
+    faces = cache.faces(MESH[1])
     for most, expected in ((64 << 20, [1]), (0, [1, 1, 1])):
         monkeypatch.setattr(config, "result_cache_bytes", most)
-        recent.forget()
+        cache.clear()
         calls.clear()
         for _ in range(3):
-            recent.results("question", [(MESH[0], faces)], measured)
+            cache.results("question", [(MESH[0], faces)], measured)
         assert calls == expected
 
 

@@ -135,10 +135,10 @@ def test_released_workers_end_and_others_start(pool, executor):
 
 
 def test_forgets_what_is_long_ago(pool, executor):
-    for k in range(module._REMEMBERED + 2):
+    for k in range(module._MOST_KEPT + 2):
         options = OPTIONS._replace(sampling=sampling(8 + k))
         worker = until_ready(pool, options)
-    assert len(worker._known) == module._REMEMBERED
+    assert len(worker._known) == module._MOST_KEPT
     check(pool, executor, batch(2), options)
 
 

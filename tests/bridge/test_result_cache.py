@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spt_jax.bridge import callback, on_host
-from spt_jax.bridge.result_cache import _ENTRY_BYTES, Recent
+from spt_jax.bridge.result_cache import _ENTRY_BYTES, ResultCache
 
 FACES = np.array([[0, 1, 2], [0, 2, 1]], np.int32)
 measured = []
@@ -21,7 +21,7 @@ def twice(vertices, faces, options):
 @pytest.fixture(autouse=True)
 def nothing_yet():
     measured.clear()
-    callback.forget()
+    callback.clear_results()
 
 
 def ask(vertices, faces=FACES, options=None):
@@ -95,63 +95,63 @@ def test_results_cannot_be_changed_through_what_was_returned():
 ENTRY = 144 + _ENTRY_BYTES
 
 
-def remember(recent, vertices, faces, asked="doubled"):
+def remember(cache, vertices, faces, asked="doubled"):
     def measure(meshes):
         measured.extend(meshes)
         return [(2 * v,) for v, _ in meshes]
 
-    return recent.results(asked, [(v, recent.faces(faces)) for v in vertices], measure)
+    return cache.results(asked, [(v, cache.faces(faces)) for v in vertices], measure)
 
 
 def test_memory_is_bounded_and_the_oldest_goes_first(rng):
-    recent = Recent(most_bytes=10 * ENTRY)
+    cache = ResultCache(most_bytes=10 * ENTRY)
     meshes = rng.normal(size=(12, 3, 3))
     for mesh in meshes[:10]:
-        remember(recent, [mesh], FACES)
-    remember(recent, meshes[:1], FACES)  # used again, so not the oldest any more
+        remember(cache, [mesh], FACES)
+    remember(cache, meshes[:1], FACES)  # used again, so not the oldest any more
     assert len(measured) == 10
-    remember(recent, meshes[10:], FACES)
-    assert recent._bytes == 10 * ENTRY
-    remember(recent, [meshes[0], *meshes[3:]], FACES)
+    remember(cache, meshes[10:], FACES)
+    assert cache._bytes == 10 * ENTRY
+    remember(cache, [meshes[0], *meshes[3:]], FACES)
     assert len(measured) == 12
-    remember(recent, meshes[1:2], FACES)
+    remember(cache, meshes[1:2], FACES)
     assert len(measured) == 13
-    recent.forget()
-    assert recent._bytes == 0
+    cache.clear()
+    assert cache._bytes == 0
 
 
 def test_a_few_lists_of_faces_and_only_their_results(rng):
-    recent = Recent(most_faces=2)
+    cache = ResultCache(most_faces=2)
     (mesh,) = rng.normal(size=(1, 3, 3))
     lists = [np.roll(FACES, k, axis=1) for k in range(3)]
-    assert recent.faces(lists[0]) is recent.faces(lists[0].copy())
-    assert recent.faces(lists[0]).dtype == np.int64
+    assert cache.faces(lists[0]) is cache.faces(lists[0].copy())
+    assert cache.faces(lists[0]).dtype == np.int64
     for faces in lists:
-        remember(recent, [mesh], faces)
-    assert len(recent._results) == 2 and recent._bytes == 2 * ENTRY
-    remember(recent, [mesh], lists[2])
+        remember(cache, [mesh], faces)
+    assert len(cache._results) == 2 and cache._bytes == 2 * ENTRY
+    remember(cache, [mesh], lists[2])
     assert len(measured) == 3
-    remember(recent, [mesh], lists[0])
+    remember(cache, [mesh], lists[0])
     assert len(measured) == 4
 
 
 def test_larger_than_the_memory_is_not_kept(rng):
-    recent = Recent(most_bytes=100)
+    cache = ResultCache(most_bytes=100)
     mesh = rng.normal(size=(1, 3, 3))
-    np.testing.assert_array_equal(remember(recent, mesh, FACES)[0][0], 2 * mesh[0])
-    assert recent._bytes == 0 and not recent._results
+    np.testing.assert_array_equal(remember(cache, mesh, FACES)[0][0], 2 * mesh[0])
+    assert cache._bytes == 0 and not cache._results
 
 
 def test_a_few_questions_and_only_their_results(rng):
     """Options may hold megabytes: a loop that asks with new ones each time keeps few of them."""
-    recent = Recent(most_asked=2)
+    cache = ResultCache(most_queries=2)
     (mesh,) = rng.normal(size=(1, 3, 3))
     for asked in ("one", "two", "one", "three"):
-        remember(recent, [mesh], FACES, asked)
+        remember(cache, [mesh], FACES, asked)
     assert len(measured) == 3
-    assert list(recent._asked) == ["one", "three"]
-    assert len(recent._results) == 2 and recent._bytes == 2 * ENTRY
-    remember(recent, [mesh], FACES, "two")
+    assert list(cache._queries) == ["one", "three"]
+    assert len(cache._results) == 2 and cache._bytes == 2 * ENTRY
+    remember(cache, [mesh], FACES, "two")
     assert len(measured) == 4
-    recent.forget_all()
-    assert not recent._asked and not recent._faces and recent._bytes == 0
+    cache.clear_all()
+    assert not cache._queries and not cache._faces and cache._bytes == 0

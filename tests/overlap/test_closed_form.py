@@ -375,7 +375,7 @@ def test_flat_sides_of_clean_solids_intersect_nowhere(name):
     mesh = np.array(FLAT[name].vertices), np.array(FLAT[name].faces, np.int64)
     for _ in range(40):
         found = solved(moved(mesh, random_rotation(rng), rng.normal(size=3)))
-        assert not len(found.surface.crossings.face)
+        assert not len(found.surface.intersections.face)
         assert found.volume == 0 and not found.labels("vertex").any()
 
 
@@ -505,10 +505,10 @@ def test_sums_that_do_not_close_are_noticed():
             surface.points, surface.topology, crossings, surface.contours, layer.ends, 0
         )
 
-    assert shares(surface.crossings).sound.all()
-    jump = surface.crossings.jump.copy()
+    assert shares(surface.intersections).sound.all()
+    jump = surface.intersections.jump.copy()
     jump[3] = 0
-    assert not shares(dataclasses.replace(surface.crossings, jump=jump)).sound.all()
+    assert not shares(dataclasses.replace(surface.intersections, jump=jump)).sound.all()
 
 
 def test_what_does_not_close_is_measured_by_rays(monkeypatch):

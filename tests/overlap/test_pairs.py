@@ -11,11 +11,11 @@ from spt_jax.overlap.triangles import pair_boxes, pair_layout
 from spt_jax.overlap.triangles.contours import find_contours
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.triangles.pair_layout import prepared
-from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
+from spt_jax.overlap.triangles.pairs import edge_intersections, face_pairs
 
 
 @pytest.fixture(autouse=True)
-def forget():
+def clear_caches():
     """No test sees the layouts that another one left."""
     pair_layout._meshes.clear()
 
@@ -26,7 +26,7 @@ def edges_of(faces):
 
 
 def found_in(mesh, **options):
-    found = edge_crossings(*mesh, **options)
+    found = edge_intersections(*mesh, **options)
     return {
         (*edge, face) for edge, face in zip(found.edge.tolist(), found.face.tolist(), strict=True)
     }
@@ -163,7 +163,7 @@ def test_crossing_or_not_agrees_with_ipc_toolkit(rng):
 def test_two_triangles_cross_along_a_segment_with_two_ends(make, rng):
     """One of the ends is the shared vertex where there is one, and not a crossing."""
     vertices, faces = make(rng)
-    found = edge_crossings(vertices, faces)
+    found = edge_intersections(vertices, faces)
     ends: dict = {}
     for of_edge, face in zip(found.edge_faces.tolist(), found.face.tolist(), strict=True):
         for other in of_edge:
@@ -176,7 +176,7 @@ def test_two_triangles_cross_along_a_segment_with_two_ends(make, rng):
 
 def test_points_lie_on_edge_and_triangle(rng):
     vertices, faces = crumpled(rng)
-    found = edge_crossings(vertices, faces)
+    found = edge_intersections(vertices, faces)
     p, q = vertices[found.edge].transpose(1, 0, 2)
     a, b, c = vertices[faces[found.face]].transpose(1, 0, 2)
     off_edge = np.linalg.norm(np.cross(found.point - p, q - p), axis=1)
@@ -269,7 +269,7 @@ def test_triangles_that_share_a_vertex_are_known_from_the_faces(spokes, rng):
 def test_large_triangles_beside_small_ones():
     small = moved(sphere(0.1, subdivisions=4), np.eye(3), (0.48, 0.03, 0.02))
     mesh = join(box((100.0, 1.0, 1.0), (-49.5, 0.0, 0.0)), small)
-    found = edge_crossings(*mesh)
+    found = edge_intersections(*mesh)
     assert len(found.face) > 100
     assert found_in(mesh) == by_candidates(*mesh)
     assert np.allclose(found.point[:, 0], 0.5)
@@ -305,18 +305,18 @@ def test_triangles_in_one_plane_only_touch(rng):
     faces = np.arange(30).reshape(10, 3)
     upright = np.array([[0.0, 0, -1], [0, 0, 1], [0.3, 0.1, 1]])
     mesh = np.concatenate([flat, upright]), np.concatenate([faces, [[30, 31, 32]]])
-    found = find_contours(mesh[0], prepared(mesh[1], 33).topology, edge_crossings(*mesh))
+    found = find_contours(mesh[0], prepared(mesh[1], 33).topology, edge_intersections(*mesh))
     proper = found.pair[found.proper(*mesh, 1e-15)]
     assert 0 < len(proper) < len(found.pair) and (proper[:, 1] == 10).all()
 
 
 def test_among_keeps_what_touches_the_marked_faces(rng):
     vertices, faces = join(noisy(sphere(subdivisions=2), 0.1, rng), crossing_boxes(rng))
-    every = edge_crossings(vertices, faces)
+    every = edge_intersections(vertices, faces)
     for share in (0.0, 0.05, 0.5, 1.0):
         marked = rng.random(len(faces)) < share
         kept = marked[every.face] | marked[every.edge_faces].any(axis=1)
-        found = edge_crossings(vertices, faces, among=marked)
+        found = edge_intersections(vertices, faces, among=marked)
         assert np.array_equal(found.edge, every.edge[kept])
         assert np.array_equal(found.face, every.face[kept])
         assert np.array_equal(found.point, every.point[kept])
@@ -328,7 +328,7 @@ def test_edges_of_one_and_of_three_triangles():
     vertices = np.array(sheet + blades, float)
     blade = np.array([[0, 1, 2], [3, 4, 5], [3, 4, 6], [3, 4, 7]])
     for count in (1, 2, 3):
-        found = edge_crossings(vertices, blade[: count + 1])
+        found = edge_intersections(vertices, blade[: count + 1])
         through = (found.edge == [3, 4]).all(axis=1)
         expected = {1: [[1, -1]], 2: [[1, 2]], 3: [[1, 2], [3, -1]]}[count]
         assert found.edge_faces[through].tolist() == expected
@@ -341,9 +341,9 @@ def test_copies_and_strangers_among_the_vertices_change_nothing(rng):
     assert found_in((extra, faces)) == found_in((vertices, faces))
     # Every corner its own vertex: the boxes' own walls now touch, and still only they cross.
     loose = (vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
-    between = face_pairs(edge_crossings(*loose))
+    between = face_pairs(edge_intersections(*loose))
     between = between[between[:, 0] // 12 != between[:, 1] // 12]
-    expected = face_pairs(edge_crossings(vertices, faces))
+    expected = face_pairs(edge_intersections(vertices, faces))
     assert between.tolist() == expected.tolist()
 
 
@@ -360,7 +360,7 @@ def test_nothing_to_find():
         (0 * vertices, faces),
         (broken, faces),
     ):
-        found = edge_crossings(*mesh)
+        found = edge_intersections(*mesh)
         assert found.edge.shape == found.edge_faces.shape == (0, 2)
         assert found.face.shape == (0,) and found.point.shape == (0, 3)
         assert face_pairs(found).shape == (0, 2)
@@ -368,12 +368,12 @@ def test_nothing_to_find():
 
 def test_faces_out_of_range_are_refused():
     with pytest.raises(IndexError, match="got indices 0 to 8 for 8 vertices"):
-        edge_crossings(np.zeros((8, 3)), np.array([[0, 1, 8]]))
+        edge_intersections(np.zeros((8, 3)), np.array([[0, 1, 8]]))
 
 
 def test_memory_of_meshes_is_bounded(rng):
     for k in range(4, 14):
-        edge_crossings(rng.normal(size=(k, 3)), np.array([[0, 1, 2], [1, 2, 3]]))
+        edge_intersections(rng.normal(size=(k, 3)), np.array([[0, 1, 2], [1, 2, 3]]))
     assert len(pair_layout._meshes) <= 4
 
 
@@ -392,5 +392,5 @@ def test_a_triangle_as_large_as_the_mesh_meets_no_empty_slot():
     corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 2, 1], [0, 3, 2], [1, 3, 0], [1, 2, 3]])
     mesh = join((corner, faces), box((0.2, 0.3, 0.4), (0.3, 0.35, 0.3)))
-    found = edge_crossings(*mesh)
+    found = edge_intersections(*mesh)
     assert len(found.face) == len(found_in(mesh)) > 0

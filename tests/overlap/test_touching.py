@@ -50,7 +50,7 @@ CONTACT = {
 def _told(mesh):
     """All that is told of a surface."""
     surface = ExactSurface(*mesh, 2.0**-52)
-    overlap, crossings = ExactOverlap(surface), surface.crossings
+    overlap, crossings = ExactOverlap(surface), surface.intersections
     found = [crossings.edge, crossings.face, crossings.part, crossings.jump, surface.proper]
     found += [surface.contacts.vertex, surface.contacts.face, overlap.winding, overlap.gradient()]
     return found, overlap.volume
@@ -85,7 +85,7 @@ def test_solids_that_touch_are_told_apart_before_any_sign_is_asked_for(monkeypat
     places = itertools.product((0.0, 1.0, 2.0, 3.0), repeat=3)
     vertices, faces = join(*(box(center=place) for place in places))
     surface = ExactSurface(vertices, faces, 2.0**-52)
-    assert not len(surface.crossings.face)
+    assert not len(surface.intersections.face)
     assert len(surface.contacts.vertex) > 1000
     assert 0 < sum(asked) < len(faces)
 

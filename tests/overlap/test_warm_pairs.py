@@ -14,7 +14,7 @@ from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.overlap.triangles import near_triangles, pair_boxes, pair_layout, warm_pairs
 from spt_jax.overlap.triangles.gaps import gaps
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, prepared
-from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
+from spt_jax.overlap.triangles.pairs import edge_intersections, face_pairs
 from spt_jax.overlap.triangles.predicates import Predicates
 
 EXACT = Sampling(None, ((1.0, 0.0, 0.0),))
@@ -116,7 +116,7 @@ def unseen(mesh, vertices):
     with pytest.MonkeyPatch.context() as changed:
         changed.setattr(near_triangles, "left_of", lambda *_: None)
         changed.setattr(near_triangles, "keep", lambda *_: None)
-        pairs = face_pairs(edge_crossings(vertices, faces))
+        pairs = face_pairs(edge_intersections(vertices, faces))
     looked_at = {frozenset(pair) for pair in left.pairs.T.tolist()}
     groups = {frozenset(pair) for pair in left.groups.T.tolist()}
     missing = 0
@@ -211,7 +211,7 @@ def test_gaps_are_lower_bounds_and_told_of_all_that_are_apart(rng):
         one, other = (weights @ corners[x[pair]] for x in (f, g))
         nearest = np.linalg.norm(one[:, None] - other, axis=2).min()
         assert found[pair] <= nearest
-    crossing = {tuple(x) for x in face_pairs(edge_crossings(vertices, faces)).tolist()}
+    crossing = {tuple(x) for x in face_pairs(edge_intersections(vertices, faces)).tolist()}
     meets = np.array([(min(x), max(x)) in crossing for x in zip(f, g, strict=True)])
     flat = (f % 7 == 0) & (g % 7 == 0)  # where they touch, ties decide
     np.testing.assert_array_equal(found[~flat] <= 0, meets[~flat])

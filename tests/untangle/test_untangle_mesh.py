@@ -26,7 +26,7 @@ from spt_jax.cli.main import main
 from spt_jax.io.mesh_files import read_mesh, write_mesh
 from spt_jax.overlap.measure import Unmeasurable, measure
 from spt_jax.overlap.triangles import near_triangles
-from spt_jax.overlap.triangles.pairs import edge_crossings
+from spt_jax.overlap.triangles.pairs import edge_intersections
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.freeing import _Search
 from spt_jax.untangle.mesh import untangle_mesh
@@ -339,14 +339,14 @@ def test_contour_forces_shorten_the_contour(rng):
     surface = Surface(faces, len(vertices))
 
     def length(points):
-        found = edge_crossings(points, surface.faces)
+        found = edge_intersections(points, surface.faces)
         pairs = {}
         for faces_of, face, point in zip(found.edge_faces, found.face, found.point, strict=True):
             for other in faces_of:
                 pairs.setdefault(frozenset((int(other), int(face))), []).append(point)
         return sum(np.linalg.norm(np.subtract(*ends)) for ends in pairs.values() if len(ends) == 2)
 
-    force = contour_forces(surface.faces, vertices, edge_crossings(vertices, surface.faces))
+    force = contour_forces(surface.faces, vertices, edge_intersections(vertices, surface.faces))
     before, step = length(vertices), 1e-4
     assert before > 3.0
     assert length(vertices + step * force) < before < length(vertices - step * force)

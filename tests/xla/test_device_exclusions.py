@@ -11,12 +11,12 @@ from helpers_penalty import compiled_names
 from spt_jax import RestSurface, self_intersection_penalty
 from spt_jax.overlap.triangles.contours import find_contours
 from spt_jax.overlap.triangles.pair_layout import prepared
-from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
+from spt_jax.overlap.triangles.pairs import edge_intersections, face_pairs
 from spt_jax.xla.exclusions import _folds, _near_at_rest
-from spt_jax.xla.pair_search import over_crossing_pairs
+from spt_jax.xla.pair_search import over_intersecting_pairs
 from spt_jax.xla.patches import spread
 from spt_jax.xla.tables import rest_table
-from spt_jax.xla.triangle_pairs import cross_each_other
+from spt_jax.xla.triangle_pairs import triangles_intersect
 
 
 @pytest.mark.slow
@@ -116,7 +116,7 @@ def test_triangles_that_cross(rng):
     half = len(faces) // 2
     first, second = np.divmod(np.arange(half * half), half)
     second += half
-    found = cross_each_other(
+    found = triangles_intersect(
         *(
             jnp.asarray(x, x.dtype.name.replace("64", "32"))
             for x in (vertices, faces[first], faces[second])
@@ -124,7 +124,7 @@ def test_triangles_that_cross(rng):
     )
     pairs = {(f, g) for f, g in zip(first[found], second[found], strict=True)}
     assert len(pairs) > 30
-    expected = face_pairs(edge_crossings(vertices, faces))
+    expected = face_pairs(edge_intersections(vertices, faces))
     assert pairs == {tuple(sorted(pair)) for pair in expected.tolist()}
 
 
@@ -138,12 +138,12 @@ def test_the_search_finds_every_pair(name, dtype):
     # Closer together, a cluster's own triangles cross as well.
     vertices[: len(vertices) // 3] += dtype.type(0.05)
 
-    def add(found, first, second, crosses):
-        return found.at[first, second].add(crosses.astype(jnp.int32))
+    def add(found, first, second, intersects):
+        return found.at[first, second].add(intersects.astype(jnp.int32))
 
     count = len(faces)
     search = jax.jit(
-        lambda v: over_crossing_pairs(
+        lambda v: over_intersecting_pairs(
             v, jnp.asarray(faces), add, jnp.zeros((count, count), "int32")
         )
     )
@@ -151,7 +151,7 @@ def test_the_search_finds_every_pair(name, dtype):
     assert found.max(initial=0) <= 1 and not (found & found.T).any()
     ours = set(map(tuple, np.sort(np.argwhere(found), axis=1).tolist()))
     points, corners = vertices.astype(np.float64), faces.astype(np.int64)
-    crossings = edge_crossings(points, corners)
+    crossings = edge_intersections(points, corners)
     contours = find_contours(points, prepared(corners, len(points)).topology, crossings)
     reach = 8 * float(np.finfo(dtype).eps)
     proper = set(map(tuple, contours.pair[contours.proper(points, corners, reach)].tolist()))
@@ -159,7 +159,7 @@ def test_the_search_finds_every_pair(name, dtype):
     for pair in ours - proper:
         apart = points[corners[list(pair)]]
         apart = apart + 1e-5 * (apart.mean(axis=1, keepdims=True) - apart)  # each a little smaller
-        alone = edge_crossings(apart.reshape(-1, 3), np.arange(6).reshape(2, 3))
+        alone = edge_intersections(apart.reshape(-1, 3), np.arange(6).reshape(2, 3))
         assert not len(alone.face), pair
 
 

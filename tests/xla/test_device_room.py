@@ -6,7 +6,7 @@ import pytest
 from helpers_device import on_host, padded
 
 from spt_jax import self_intersection_penalty
-from spt_jax.xla.settings import Xla, room
+from spt_jax.xla.settings import Xla, buffer_sizes
 from spt_jax.xla.usage import device_usage
 
 RAYS = 48
@@ -56,8 +56,8 @@ def test_a_row_that_does_not_fit_is_reported(name):
 
 def test_wrong_sizes():
     with pytest.raises(ValueError, match="crossings must be a positive whole number"):
-        room(Xla(crossings=0), 64)
+        buffer_sizes(Xla(crossings=0), 64)
     with pytest.raises(ValueError, match="segments must be at most"):
-        room(Xla(segments=2**30), 64)
+        buffer_sizes(Xla(segments=2**30), 64)
     with pytest.raises(ValueError, match="sorted must be at most"):
-        room(Xla(sorted=2**30), 64)
+        buffer_sizes(Xla(sorted=2**30), 64)

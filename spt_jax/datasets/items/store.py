@@ -146,7 +146,7 @@ class Store:
             finally:
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def forget(self, name: str) -> None:
+    def discard(self, name: str) -> None:
         """A file is not done any more."""
         self._row(name).unlink(missing_ok=True)
 

@@ -39,7 +39,7 @@ from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.triangles.contours import Contours, senses
 from spt_jax.overlap.triangles.pair_layout import Topology
-from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.triangles.winding import Ends
 from spt_jax.overlap.vectors import area_normals, cross, dot, summed
 
@@ -78,7 +78,7 @@ class Shares:
 def shares_of(
     vertices: Float[np.ndarray, "V 3"],
     topology: Topology,
-    crossings: EdgeCrossings,
+    intersections: EdgeIntersections,
     contours: Contours,
     ends: Ends,
     layer: int,
@@ -89,7 +89,7 @@ def shares_of(
     Args:
         vertices: positions.
         topology: of the mesh.
-        crossings, contours: those that count on the layer.
+        intersections, contours: those that count on the layer.
         ends: the winding numbers.
         layer: which of them.
         times: how often each triangle is there, all copies in one place; once if not given. Of
@@ -110,11 +110,13 @@ def shares_of(
     row[found] = np.arange(len(found))
     corners = faces[found]
     normals = area_normals(vertices, corners)
-    sums = _sides(topology, crossings, ends, layer, found, row, times)
+    sums = _sides(topology, intersections, ends, layer, found, row, times)
     if len(contours.pair):
         # Once along the first triangle of each pair, and once the other way along the second.
         at = row[contours.pair.T.ravel()]
-        start, end = _coordinates(vertices, topology, crossings, contours, corners[at], normals[at])
+        start, end = _coordinates(
+            vertices, topology, intersections, contours, corners[at], normals[at]
+        )
         steps = _along(start, end)
         steps[len(contours.pair) :] *= -1.0
         if times is not None:
@@ -133,7 +135,7 @@ def of_copies(times: Int[np.ndarray, "H"]) -> Float[np.ndarray, "H"]:
     return (times - 1) / 12.0  # half of the integral of lambda
 
 
-def _coordinates(vertices, topology, crossings, contours: Contours, corners, normals):
+def _coordinates(vertices, topology, intersections, contours: Contours, corners, normals):
     """(u, v) of the segments' starts and ends, on the first triangles and then on the second ones.
 
     Args:
@@ -154,7 +156,9 @@ def _coordinates(vertices, topology, crossings, contours: Contours, corners, nor
         number, owner = contours.end[:, k], contours.owner[:, k]
         passing = np.flatnonzero(number >= 0)
         mine = passing + owner[passing] * len(number)
-        at[mine] = _on_sides(topology, contours.half[passing, k], crossings.part[number[passing]])
+        at[mine] = _on_sides(
+            topology, contours.half[passing, k], intersections.part[number[passing]]
+        )
         ending = np.flatnonzero(np.tile(number < 0, 2))
         at[ending] = _CORNERS[np.argmax(corners[ending] == cusp[ending], axis=1)]
     return found
@@ -180,7 +184,9 @@ def _along(start, end) -> Float[np.ndarray, "K 5"]:
 _SIDES = _along(_CORNERS, np.roll(_CORNERS, -1, axis=0))
 
 
-def _sides(topology: Topology, crossings: EdgeCrossings, ends: Ends, layer, found, row, times):
+def _sides(
+    topology: Topology, intersections: EdgeIntersections, ends: Ends, layer, found, row, times
+):
     """The sides' part of all sums."""
     corners = topology.faces[found]
     count = len(found)
@@ -193,21 +199,21 @@ def _sides(topology: Topology, crossings: EdgeCrossings, ends: Ends, layer, foun
         begins[face, turn] = ends.of_ends(topology, there, end)[:, layer]
     sums = begins @ _SIDES
 
-    number, half = sides_of(topology, crossings)
-    jump = crossings.jump[number] * senses(topology, half)
+    number, half = sides_of(topology, intersections)
+    jump = intersections.jump[number] * senses(topology, half)
     if times is not None:
-        jump = jump * times[crossings.face[number]]
-    at = _on_sides(topology, half, crossings.part[number])
+        jump = jump * times[intersections.face[number]]
+    at = _on_sides(topology, half, intersections.part[number])
     rest = _along(at, _CORNERS[(half % 3 + 2) % 3])
     return sums + summed(row[half // 3], jump[:, None] * rest, count)
 
 
 def sides_of(
-    topology: Topology, crossings: EdgeCrossings
+    topology: Topology, intersections: EdgeIntersections
 ) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
     """Each edge that passes through a triangle is a side of two others: crossing, half-edge."""
-    number = np.tile(np.arange(len(crossings.face)), 2)
-    half = topology.halves[crossings.row].T.ravel()
+    number = np.tile(np.arange(len(intersections.face)), 2)
+    half = topology.halves[intersections.row].T.ravel()
     kept = np.flatnonzero(half >= 0)
     return number[kept], half[kept]
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax.overlap.triangles.pair_layout import Topology
-from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.vectors import area_normals, cross, dot
 
 
@@ -39,7 +39,7 @@ class Contours:
 
     Attributes:
         pair: the two triangles, the lower first.
-        end: (P, 2), the start and the end as rows of the crossings; -1: the shared vertex.
+        end: (P, 2), the start and the end as rows of the intersections; -1: the shared vertex.
         owner: which of the two triangles has the edge that passes there.
         half: that edge as a half-edge of the triangle.
         cusp: the vertex that the two share; -1: none.
@@ -84,20 +84,20 @@ class Contours:
 
 
 def find_contours(
-    vertices: Float[np.ndarray, "V 3"], topology: Topology, crossings: EdgeCrossings
+    vertices: Float[np.ndarray, "V 3"], topology: Topology, intersections: EdgeIntersections
 ) -> Contours:
     """The segment of every pair of triangles that intersect."""
     faces, count = topology.faces, len(topology.faces)
-    number = np.tile(np.arange(len(crossings.face)), 2)
-    half = topology.halves[crossings.row].T.ravel()
+    number = np.tile(np.arange(len(intersections.face)), 2)
+    half = topology.halves[intersections.row].T.ravel()
     kept = np.flatnonzero(half >= 0)
     number, half = number[kept], half[kept]
-    own, other = half // 3, crossings.face[number]
+    own, other = half // 3, intersections.face[number]
     first = own < other
     # Along its own edges, counter-clockwise, each triangle enters the other's solid once and leaves
     # it once. The segment runs from where the first triangle leaves to where it enters, and for
     # the second the other way about: on the left of it is the first one's part inside the second.
-    enters = crossings.jump[number] * senses(topology, half) > 0
+    enters = intersections.jump[number] * senses(topology, half) > 0
     last = enters == first
     key = np.where(first, own * count + other, other * count + own)
     pairs, at = np.unique(key, return_inverse=True)
@@ -112,7 +112,7 @@ def find_contours(
     row, vertex = shared_corners(faces, pair)
     cusp[row] = vertex
     common = np.bincount(row, minlength=len(pair))
-    point = crossings.point[end] if len(crossings.face) else np.zeros((len(pair), 2, 3))
+    point = intersections.point[end] if len(intersections.face) else np.zeros((len(pair), 2, 3))
     missing = end < 0
     point[missing] = vertices[np.repeat(cusp[:, None], 2, axis=1)[missing]]
     whole = (found <= 1).all(axis=1) & (found.sum(axis=1) + common == 2)
@@ -138,13 +138,13 @@ def shared_corners(
 def length_gradient(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    crossings: EdgeCrossings,
+    intersections: EdgeIntersections,
     contours: Contours,
     weight: Float[np.ndarray, "P"],
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
     """The derivative of the weighted sum of the segments' lengths: vertices, and force on each.
 
-    Its ends pass their forces on by `force_on_crossings`; a vertex that the two triangles share
+    Its ends pass their forces on by `force_on_intersections`; a vertex that the two triangles share
     takes its own.
     """
     along = contours.point[:, 1] - contours.point[:, 0]
@@ -154,15 +154,15 @@ def length_gradient(
     end, cusp = contours.end.ravel(), np.repeat(contours.cusp, 2)
     at_cusp = np.flatnonzero((end < 0) & (cusp >= 0))
     passing = np.flatnonzero(end >= 0)
-    through = crossings.only(end[passing])
-    at, rows = force_on_crossings(vertices, faces, through, force[passing])
+    through = intersections.only(end[passing])
+    at, rows = force_on_intersections(vertices, faces, through, force[passing])
     return np.concatenate([cusp[at_cusp], at]), np.concatenate([force[at_cusp], rows])
 
 
-def force_on_crossings(
+def force_on_intersections(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    crossings: EdgeCrossings,
+    intersections: EdgeIntersections,
     force: Float[np.ndarray, "K 3"],
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
     """Forces on places where edges pass through triangles, as vertices and the force on each.
@@ -171,14 +171,14 @@ def force_on_crossings(
     alpha a + beta b + gamma c. A force f on it acts on the edge as f - h and on the triangle as h,
     h = n f.(q - p) / n.(q - p), in these shares.
     """
-    p, q = crossings.edge.T
-    corners = faces[crossings.face]
+    p, q = intersections.edge.T
+    corners = faces[intersections.face]
     edge = vertices[q] - vertices[p]
     normal = area_normals(vertices, corners)
     through = dot(normal, edge)
     h = normal * (dot(force, edge) / np.where(through != 0, through, np.inf))[:, None]
-    part = crossings.part[:, None]
-    shares = barycentric(vertices[corners], crossings.point)
+    part = intersections.part[:, None]
+    shares = barycentric(vertices[corners], intersections.point)
     rows = [(1 - part) * (force - h), part * (force - h)]
     rows += [shares[:, c, None] * h for c in range(3)]
     return np.concatenate([p, q, *corners.T]), np.concatenate(rows)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from spt_jax.overlap.triangles.contours import Contours, barycentric, senses
 from spt_jax.overlap.triangles.pair_layout import Topology
-from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.vectors import area_normals, cross, dot, summed
 
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # (u, v) of a triangle's corners
@@ -21,20 +21,20 @@ _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # (u, v) of a triangl
 
 @dataclass(frozen=True)
 class Rates:
-    """Velocities of crossings: of the part of the edge, the place and the barycentric weights."""
+    """Velocities of the part of the edge, the place and the barycentric weights."""
 
     part: Float[np.ndarray, "K"]
     point: Float[np.ndarray, "K 3"]
     shares: Float[np.ndarray, "K 3"]
 
 
-class MovingCrossings:
+class MovingIntersections:
     """Edges that pass through triangles, as functions of the vertices.
 
     Args:
         vertices: positions.
         faces: of the mesh.
-        crossings: the edges and the triangles.
+        intersections: the edges and the triangles.
         parallel: an edge whose angle with the triangle's plane has a sine below this is parallel to
             it but for rounding: where it passes has no derivative, and is held.
     """
@@ -43,18 +43,18 @@ class MovingCrossings:
         self,
         vertices: Float[np.ndarray, "V 3"],
         faces: Int[np.ndarray, "F 3"],
-        crossings: EdgeCrossings,
+        intersections: EdgeIntersections,
         parallel: float,
     ):
-        self.crossings, self.corners = crossings, faces[crossings.face]
-        self.start, self.end = crossings.edge.T
+        self.intersections, self.corners = intersections, faces[intersections.face]
+        self.start, self.end = intersections.edge.T
         self.edge = vertices[self.end] - vertices[self.start]
         triangles = vertices[self.corners]
         a, b, c = triangles.transpose(1, 0, 2)
         self.ab, self.ac = b - a, c - a
         self.normal = area_normals(vertices, self.corners)
-        self.part, self.point = crossings.part, crossings.point
-        self.shares = barycentric(triangles, crossings.point)
+        self.part, self.point = intersections.part, intersections.point
+        self.shares = barycentric(triangles, intersections.point)
         square = dot(self.normal, self.normal)
         through = dot(self.normal, self.edge)
         size = np.sqrt(square * dot(self.edge, self.edge))
@@ -86,21 +86,21 @@ class MovingContours:
     Args:
         vertices: positions.
         topology: of the mesh.
-        crossings: those that the contours' ends are rows of.
+        intersections: those that the contours' ends are rows of.
         contours: the segments.
-        parallel: as in `MovingCrossings`.
+        parallel: as in `MovingIntersections`.
     """
 
     def __init__(
         self,
         vertices: Float[np.ndarray, "V 3"],
         topology: Topology,
-        crossings: EdgeCrossings,
+        intersections: EdgeIntersections,
         contours: Contours,
         parallel: float,
     ):
         self.faces, self.contours = topology.faces, contours
-        self.moving = MovingCrossings(vertices, self.faces, crossings, parallel)
+        self.moving = MovingIntersections(vertices, self.faces, intersections, parallel)
         self._segment, self._end = np.nonzero(contours.end >= 0)
         self._number = contours.end[self._segment, self._end]
         self._owner = contours.owner[self._segment, self._end]
@@ -137,7 +137,7 @@ class MovingContours:
         moves across itself: quadratic, so that Simpson's rule is exact.
 
         Args:
-            rates: of the crossings.
+            rates: of the intersections.
             row: of each face of the mesh, in what is returned.
             count: how many rows that has.
             times: how often each triangle is there.
@@ -161,7 +161,7 @@ class MovingContours:
     def end_velocities(
         self, rates: Rates, velocity: Float[np.ndarray, "V 3"]
     ) -> Float[np.ndarray, "P 2 3"]:
-        """How fast the segments' ends move: crossings, or the vertex that two triangles share."""
+        """How fast the segments' ends move; an end may be a vertex that two triangles share."""
         moves = np.zeros((len(self.contours.pair), 2, 3))
         moves[self._segment, self._end] = rates.point[self._number]
         segment, end = np.nonzero((self.contours.end < 0) & (self.contours.cusp >= 0)[:, None])
@@ -180,7 +180,7 @@ class MovingContours:
 
         Args:
             velocity: of the vertices.
-            rates: of the crossings, at that velocity.
+            rates: of the intersections, at that velocity.
             weight, change: of each segment, and how fast that changes.
             count: of the vertices.
         """

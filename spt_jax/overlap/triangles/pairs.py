@@ -1,10 +1,10 @@
 """Which edges of a mesh pass through which of its triangles: every place where it cuts itself.
 
-Triangles that share a vertex are told apart by that vertex: if the triangles around it, seen
-along some direction, lie side by side, none of them meets another. That holds nearly everywhere,
-and is proved for all vertices at once; only where it is not are these pairs examined. Triangles
-that share no vertex are found by boxes: of clusters of neighbors, then of the triangles in them.
-What is left is decided by the signs of volumes, which are exact (`predicates.py`).
+Triangles around one vertex do not intersect each other if, seen along some direction, they lie side
+by side. That holds nearly everywhere and is proved for all vertices at once; only where the proof
+fails are these pairs examined. Pairs that share no vertex are found by boxes: of clusters of
+neighbors, then of the triangles in them. The remaining pairs are decided by the signs of volumes,
+which are exact (`predicates.py`).
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from spt_jax.overlap.triangles.predicates import Predicates
 
 
 @dataclass(frozen=True)
-class EdgeCrossings:
+class EdgeIntersections:
     """Edges that pass through triangles, sorted by edge and then by triangle.
 
     Attributes:
@@ -45,25 +45,25 @@ class EdgeCrossings:
     point: Float[np.ndarray, "K 3"]
     jump: Int[np.ndarray, "K"]
 
-    def only(self, kept: Bool[np.ndarray, "K"] | Int[np.ndarray, "N"]) -> "EdgeCrossings":
-        """Some of the crossings, marked or by number."""
+    def only(self, kept: Bool[np.ndarray, "K"] | Int[np.ndarray, "N"]) -> "EdgeIntersections":
+        """Some of the intersections, given by a mask or by number."""
         return replace(self, **{name: value[kept] for name, value in vars(self).items()})
 
 
-def edge_crossings(
+def edge_intersections(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     *,
     among: Bool[np.ndarray, "F"] | None = None,
-) -> EdgeCrossings:
+) -> EdgeIntersections:
     """Every edge that passes through a triangle with which it shares no vertex.
 
     Edge pq passes through triangle abc where the tetrahedra pabc and qabc have opposite signed
     volumes and pqab, pqbc and pqca have one sign. The signs are exact, and those of volumes that
-    are exactly zero are decided as `predicates.py` says: the crossings are those of a surface in
-    general position, which differs from the one given by less than any number. So two triangles
-    always cross along a segment that has two ends; whether they only touch, `Contours.proper`
-    tells.
+    are exactly zero are decided as `predicates.py` says: the intersections are those of a surface
+    in general position, which differs from the one given by less than any number. So two triangles
+    always intersect along a segment that has two ends; `Contours.proper` is False where they only
+    touch.
 
     Args:
         vertices: positions, in any unit.
@@ -71,11 +71,11 @@ def edge_crossings(
             to an edge, repeated. What follows from them alone is kept for the next call, for the
             last few meshes; how fast a call is, but not what it returns, depends on the shapes
             in which the mesh has been seen.
-        among: faces of interest: only crossings of an edge that belongs to one of them, or that
+        among: faces of interest: only intersections of an edge that belongs to one of them, or that
             pass through one of them, are returned.
 
     Returns:
-        The crossings, sorted; none where any vertex is not finite, or all are one point.
+        The intersections, sorted; none where any vertex is not finite, or all are one point.
 
     Raises:
         IndexError: a face does not index into the vertices.
@@ -83,10 +83,10 @@ def edge_crossings(
 
     Example:
         >>> import numpy as np
-        >>> from spt_jax.overlap.triangles.pairs import edge_crossings
+        >>> from spt_jax.overlap.triangles.pairs import edge_intersections
         >>> flat = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
         >>> upright = [[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
-        >>> found = edge_crossings(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
+        >>> found = edge_intersections(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
         >>> print(found.edge.tolist(), found.face, found.point.tolist())
         [[3, 4], [3, 5]] [0 0] [[1.0, 1.0, 0.0], [1.5, 1.0, 0.0]]
     """
@@ -100,8 +100,8 @@ def find_intersections(
     among: Bool[np.ndarray, "F"] | None = None,
     predicates: Predicates | None = None,
     reach: float = 0.0,
-) -> tuple[EdgeCrossings, Callable[[], Contacts]]:
-    """`edge_crossings`, and what finds the vertices that lie on other triangles when it is called.
+) -> tuple[EdgeIntersections, Callable[[], Contacts]]:
+    """`edge_intersections`, and a function that finds the vertices that lie on other triangles.
 
     Args:
         vertices, faces, among: as there.
@@ -111,7 +111,7 @@ def find_intersections(
     nothing = np.zeros(0, np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         pairs, places = np.zeros((0, 2), np.int64), np.zeros((0, 3))
-        none = EdgeCrossings(pairs, pairs, nothing, nothing, np.zeros(0), places, nothing)
+        none = EdgeIntersections(pairs, pairs, nothing, nothing, np.zeros(0), places, nothing)
         return none, lambda: Contacts(nothing, nothing)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise IndexError(
@@ -141,30 +141,30 @@ def find_intersections(
     ends = topology.ends[row]
     p, q = np.float64(vertices[ends[:, 0]]), np.float64(vertices[ends[:, 1]])
     point = p + part[:, None] * (q - p)
-    found = EdgeCrossings(ends, topology.edge_faces[row], row, face, part, point, jump)
+    found = EdgeIntersections(ends, topology.edge_faces[row], row, face, part, point, jump)
     return found, lambda: near.contacts
 
 
-def face_pairs(crossings: EdgeCrossings) -> Int[np.ndarray, "P 2"]:
-    """Unique pairs of triangles (the lower first) that cross along some segment.
+def face_pairs(intersections: EdgeIntersections) -> Int[np.ndarray, "P 2"]:
+    """Unique pairs of triangles (the lower first) that intersect along some segment.
 
     Args:
-        crossings: what `edge_crossings` found.
+        intersections: what `edge_intersections` found.
 
     Returns:
         The triangles of each edge, where it has them, with the triangle that it passes through.
 
     Example:
         >>> import numpy as np
-        >>> from spt_jax.overlap.triangles.pairs import edge_crossings, face_pairs
+        >>> from spt_jax.overlap.triangles.pairs import edge_intersections, face_pairs
         >>> flat = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
         >>> upright = [[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
-        >>> found = edge_crossings(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
+        >>> found = edge_intersections(np.array(flat + upright), np.array([[0, 1, 2], [3, 4, 5]]))
         >>> print(face_pairs(found))
         [[0 1]]
     """
-    of_edge = crossings.edge_faces.ravel()
-    through = np.repeat(crossings.face, 2)
+    of_edge = intersections.edge_faces.ravel()
+    through = np.repeat(intersections.face, 2)
     kept = of_edge >= 0
     of_edge, through = of_edge[kept], through[kept]
     low, high = np.minimum(of_edge, through), np.maximum(of_edge, through)

@@ -50,7 +50,7 @@ from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours
 from spt_jax.overlap.triangles.manifold import Manifold
 from spt_jax.overlap.triangles.pair_layout import Topology
-from spt_jax.overlap.triangles.pairs import EdgeCrossings
+from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.triangles.predicates import Predicates
 
 # Pairs of a ray and a triangle that are worked on together.
@@ -97,7 +97,7 @@ def winding_numbers(
     topology: Topology,
     manifold: Manifold,
     predicates: Predicates,
-    crossings: EdgeCrossings,
+    intersections: EdgeIntersections,
     contours: Contours,
     counts: Bool[np.ndarray, "K L"],
     layers,
@@ -109,9 +109,9 @@ def winding_numbers(
         topology: of the mesh.
         manifold: its parts.
         predicates: the signs.
-        crossings: every edge that passes through a triangle.
+        intersections: every edge that passes through a triangle.
         contours: of these.
-        counts: which crossings count, on each layer.
+        counts: which intersections count, on each layer.
         layers: function of two arrays of parts: whether the second counts for the first, (M, L).
         times: how often each part is there, all copies in one place; once if not given.
 
@@ -121,10 +121,10 @@ def winding_numbers(
     if times is None:
         times = np.ones(manifold.num_parts, np.int64)
     of_face = times[manifold.part[topology.faces[:, 0]]]
-    jumps = crossings.jump * of_face[crossings.face]
+    jumps = intersections.jump * of_face[intersections.face]
     cusp = np.zeros(len(topology.used), bool)
     cusp[contours.cusp[contours.cusp >= 0]] = True
-    cut, of = np.unique(crossings.row, return_inverse=True)
+    cut, of = np.unique(intersections.row, return_inverse=True)
     jump = np.stack(
         [np.bincount(of, jumps * on, len(cut)).astype(np.int64) for on in np.asarray(counts).T],
         axis=1,
