@@ -24,7 +24,7 @@ try:
 except ImportError:  # a tree from before the folder
     from spt_jax import host as callback
 
-clear_results = getattr(callback, "clear_results", None) or callback.forget
+clear_results = vars(callback).get("clear_results") or vars(callback)["forget"]
 
 # Frames that collide, to be untangled.
 COLLIDING = (
