@@ -139,7 +139,7 @@ def main(settings: Settings) -> None:
         command = "python -m benchmarks.between_meshes --record"
         text = (
             "Balls and finger are polyhedra a little inside the formula's round solids. Depths by "
-            " voxels are the distance transform's, of the vertices of the first mesh; contact is "
+            "voxels are the distance transform's, of the vertices of the first mesh; contact is "
             f"within {1e3 * CONTACT:g} mm."
         )
         body = "\n\n".join([provenance(command), text, found.markdown()])
