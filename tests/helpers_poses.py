@@ -6,6 +6,7 @@ Nothing here uses the readers. Each writer returns the content of a file and wha
 import io
 import json
 import pickle
+import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -467,9 +468,9 @@ _MIXAMO_NAMES = (
 )
 
 
-def bvh(order="ZXY", names=_SMPL_NAMES, prefix="", bones=_BONES, turned=None):
+def bvh(order="ZXY", names=_SMPL_NAMES, prefix="", bones=_BONES, turned=None, pose=None):
     """A skeleton in centimetres; `turned` has what turns SMPL's rest pose into the file's."""
-    pose, (trans, _) = motion(3, 22), _beside(3)
+    pose, (trans, _) = motion(3, 22) if pose is None else pose, _beside(3)
     parents = [bone[0] for bone in bones]
     lines, angles = ["HIERARCHY"], []
     turned = turned or {}
@@ -489,7 +490,9 @@ def bvh(order="ZXY", names=_SMPL_NAMES, prefix="", bones=_BONES, turned=None):
         matrix = above @ as_matrix(pose[:, k]) @ turned.get(k, unturned).T
         if k == 0:
             angles.append(100.0 * trans)
-        angles.append(Rotation.from_matrix(matrix).as_euler(order, degrees=True))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Gimbal lock")
+            angles.append(Rotation.from_matrix(matrix).as_euler(order, degrees=True))
         children = [child for child, parent in enumerate(parents) if parent == k]
         for child in children:
             write(child, depth + 1)
@@ -523,11 +526,58 @@ def bvh_a_pose():
     return bvh(bones=tuple(bones), turned=turns)
 
 
+def in_own_axes(turned):
+    """The bones where each joint has axes of its own."""
+    return tuple(
+        (parent, *(turned[parent] @ away).tolist()) if parent >= 0 else (parent, *away)
+        for parent, *away in _BONES
+    )
+
+
+def bvh_lafan():
+    """Axes as LAFAN1 has them: x along the bones, so that in the zero pose all lie along it.
+
+    Written from what one of its frames shows in a T pose: where x, y and z of each joint point.
+    """
+    left, up, front = np.eye(3)
+    fall = np.radians(25)
+    foot = (np.cos(fall) * front - np.sin(fall) * up, np.cos(fall) * up + np.sin(fall) * front)
+    axes = (
+        ((0, 3, 6, 9, 12, 15), (up, front, left)),
+        ((1, 2, 4, 5), (-up, front, -left)),
+        ((7, 8), (*foot, -left)),
+        ((10, 11), (front, up, -left)),
+        ((13, 16, 18, 20), (left, -front, up)),
+        ((14, 17, 19, 21), (-left, -front, -up)),
+    )
+    names = tuple(name.replace("ToeBase", "Toe") for name in _MIXAMO_NAMES)
+    turned = {k: np.stack(rows) for joints, rows in axes for k in joints}
+    return bvh("ZYX", names, bones=in_own_axes(turned), turned=turned)
+
+
+def bvh_first_frame():
+    """Any axes; the first frame is a T pose that faces elsewhere, and one bone is not known."""
+    random = Rotation.random(22, random_state=7).as_matrix()
+    names = tuple("Thorax" if name == "Spine2" else name for name in _MIXAMO_NAMES)
+    pose = motion(3, 22)
+    pose[0] = 0
+    pose[0, 0, 1] = 0.7
+    pose[:, 9] = 0
+    return bvh("ZYX", names, "", in_own_axes(random), dict(enumerate(random)), pose)
+
+
+def bvh_z_up():
+    """Rests in a T pose with z up, the front towards -y."""
+    turned = dict.fromkeys(range(22), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    return bvh(bones=in_own_axes(turned), turned=turned)
+
+
 MADE = {
     made.__name__: made
     for made in (
         amass, amass_smplx, moyo, smplifyx, prox, vposer, hmr2, six_rows, six_columns, quaternions,
         quaternions_xyzw, parts_json, phalp, vibe, wham, gvhmr, tram, romp, bev_video, slahmr,
         bedlam, aistpp, threedpw, easymocap, mmhuman3d, motion_x, bvh, bvh_mixamo, bvh_a_pose,
+        bvh_lafan, bvh_first_frame, bvh_z_up,
     )
 }  # fmt: skip

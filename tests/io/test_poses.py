@@ -408,3 +408,59 @@ def test_a_number_of_any_length_is_refused_in_one_line(tmp_path):
 
 def test_refusals_are_of_one_kind():
     assert issubclass(RefusedPickleError, ValueError)
+
+
+def places_of(axes, offsets, parents):
+    """Where joints are, from the root, whose axes these are."""
+    places = np.zeros((len(parents), 3))
+    for k, parent in enumerate(parents):
+        if parent >= 0:
+            places[k] = places[parent] + axes[parent] @ offsets[k]
+    return places
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (made.bvh_lafan, "x of the skeleton's joints is taken to run along its bones"),
+        (made.bvh_first_frame, "the first frame is taken for the T pose"),
+        (made.bvh_z_up, "the skeleton rests with z up and -y in front"),
+    ],
+)
+def test_whatever_axes_a_skeleton_has_its_body_moves_as_it_does(tmp_path, make, said):
+    """Joints are where the file's own offsets and angles place them."""
+    file = tmp_path / "x.bvh"
+    file.write_bytes(make().content)
+    opened = open_poses(file)
+    assert any(note.startswith(said) for note in opened.notes), opened.notes
+    assert any("centimetres" in note for note in opened.notes)
+    tree = open_container(file).tree
+    joints = [joint for joint in tree["joints"] if joint.channels]
+    rows = [k for k, joint in enumerate(tree["joints"]) if joint.channels]
+    parents = [rows.index(joint.parent) if joint.parent >= 0 else -1 for joint in joints]
+    order = "".join(channel[0] for channel in joints[1].channels)
+    (track,) = opened.tracks
+    for pose, row in zip(track.pose, tree["motion"], strict=True):
+        axes, turned = [], []
+        for k, parent in enumerate(parents):
+            turn = as_euler_matrix(order, row[3 + 3 * k : 6 + 3 * k])
+            axes.append(axes[parent] @ turn if parent >= 0 else turn)
+        for k, parent in enumerate(p for p, *_ in made._BONES):
+            turn = as_matrix(pose[k])
+            turned.append(turned[parent] @ turn if parent >= 0 else turn)
+        places = places_of(axes, [joint.offset for joint in joints], parents)
+        wanted = places_of(turned, [b[1:] for b in made._BONES], [b[0] for b in made._BONES])
+        found = {tuple(place.round(4) + 0.0) for place in places}
+        assert found == {tuple(place.round(4) + 0.0) for place in wanted}
+        assert len(found) == 22
+
+
+def as_euler_matrix(order, degrees):
+    matrix = np.eye(3)
+    for axis, angle in zip(order, np.radians(degrees), strict=True):
+        one, other = {"X": (1, 2), "Y": (2, 0), "Z": (0, 1)}[axis]
+        turn = np.eye(3)
+        turn[[one, other], [one, other]] = np.cos(angle)
+        turn[other, one], turn[one, other] = np.sin(angle), -np.sin(angle)
+        matrix = matrix @ turn
+    return matrix

@@ -1,29 +1,24 @@
 """BVH: a skeleton with its rest pose, and Euler angles in degrees for each of its joints.
 
-The format is that of Biovision as Jeff Lander wrote it down ("Working with Motion Capture File
-Formats", Game Developer, January 1998). What the bones are called and how the skeleton stands at
-rest is every program's own: names are looked up in two lists, and a rest pose that is not SMPL's
-T is turned into it where the difference is one of directions alone.
+What the bones are called and how the skeleton stands at rest is every program's own: names are
+looked up in two lists, and `bvh_rest` finds the stance that is SMPL's T pose.
 """
 
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spt_jax.body.poses import SMPL_LAYOUTS
+from spt_jax.io.poses.bvh_rest import rest_of
+from spt_jax.io.poses.bvh_tree import Joint
 from spt_jax.io.poses.rotations import euler
 from spt_jax.io.poses.source import Block, Source
 from spt_jax.io.poses.track import Track
 
-_MOST_DEPTH = 1000
 # The longest a skeleton in metres is; those in centimetres or inches are longer.
 _TALLEST = 4.0
-# Beyond this the bones do not say how a joint is turned about its own bone.
-_MOST_DEGREES = 75.0
 
 # What bones are called after `_plain`, in SMPL's order of the first 22 joints: by SMPL itself, and
 # by Mixamo, CMU (cgspeed's conversion), LAFAN1 and MotionBuilder.
@@ -48,129 +43,6 @@ _SIDED: dict[str, tuple[str, ...]] = {
 }
 _FINGER = re.compile(r"(left|right)(?:hand)?(thumb|index|middle|ring|pinky)([123])")
 _NEEDED = ("pelvis", "left_hip", "right_hip", "left_shoulder", "right_shoulder")
-_CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
-# Towards which joint a bone runs, and its direction in SMPL's T pose: y up, x to the left.
-_TOWARDS: dict[str, tuple[str, tuple[float, float, float]]] = {
-    **{
-        f"{side}_{joint}": (f"{side}_{child}", (sign * along, down, 0.0))
-        for side, sign in (("left", 1.0), ("right", -1.0))
-        for joint, child, along, down in (
-            ("hip", "knee", 0.0, -1.0),
-            ("knee", "ankle", 0.0, -1.0),
-            ("shoulder", "elbow", 1.0, 0.0),
-            ("elbow", "wrist", 1.0, 0.0),
-        )
-    },
-}
-
-
-class Joint(NamedTuple):
-    """A joint of the file: its name, parent, offset, and the columns of its channels by name."""
-
-    name: str
-    parent: int
-    offset: tuple[float, float, float]
-    channels: tuple[str, ...]
-    column: int
-
-
-def parse_bvh(content: bytes, path: Path) -> dict[str, Any]:
-    """The tree of a BVH file: `header` (text), `joints`, `frame_time` and `motion`, a row a frame.
-
-    Raises:
-        ValueError: it is none, or is cut.
-    """
-    text = content.decode("utf-8-sig", "replace")
-    head, found, rest = text.partition("MOTION")
-    counts = re.match(r"\s*Frames:\s*(\S+)\s+Frame Time:\s*(\S+)[ \t]*\r?\n?", rest)
-    if not found or counts is None:
-        raise ValueError(
-            f"pose file must have MOTION, Frames and Frame Time after its skeleton: got "
-            f"{str(path)!r} without; it is cut."
-        )
-    joints = _joints(head.split(), path)
-    width = sum(len(joint.channels) for joint in joints)
-    numbers = rest[counts.end() :].split()
-    try:
-        frames, time = int(counts[1]), float(counts[2])
-        motion = np.array(numbers, np.float64)
-    except ValueError as error:
-        raise ValueError(
-            f"MOTION must hold numbers: got {str(path)!r} with {str(error)[:80]}; it is damaged."
-        ) from None
-    if frames < 1 or not width or len(motion) != frames * width:
-        raise ValueError(
-            f"MOTION must hold {counts[1]} frames of {width} numbers: got {len(motion)} numbers in "
-            f"{str(path)!r}; it is cut or damaged."
-        )
-    return {
-        "header": head,
-        "joints": joints,
-        "frame_time": time,
-        "motion": motion.reshape(frames, width),
-    }
-
-
-def _joints(words: list[str], path: Path) -> list[Joint]:
-    joints: list[Joint] = []
-    stack: list[int] = []
-    column, k = 0, 1
-
-    def wrong(what: str) -> ValueError:
-        return ValueError(
-            f"HIERARCHY must be a tree of ROOT, JOINT and End Site: got {str(path)!r} with {what}; "
-            "it is cut or damaged."
-        )
-
-    try:
-        while k < len(words):
-            word = words[k]
-            if word in ("ROOT", "JOINT", "End"):
-                end = words.index("{", k)
-                name = " ".join(words[k + 1 : end])
-                if words[end + 1] != "OFFSET" or len(stack) > _MOST_DEPTH:
-                    raise wrong(f"{name[:40]!r} without OFFSET")
-                offset = tuple(float(x) for x in words[end + 2 : end + 5])
-                if not np.isfinite(offset).all():
-                    raise wrong(f"an offset of {offset} at {name[:40]!r}")
-                parent = stack[-1] if stack else -1
-                channels: tuple[str, ...] = ()
-                k = end + 5
-                if word != "End":
-                    if words[k] != "CHANNELS":
-                        raise wrong(f"{name[:40]!r} without CHANNELS")
-                    count = int(words[k + 1])
-                    channels = tuple(words[k + 2 : k + 2 + count])
-                    if not all(_CHANNEL.fullmatch(channel) for channel in channels):
-                        raise wrong(f"the channels {' '.join(channels)[:60]}")
-                    k += 2 + count
-                stack.append(len(joints))
-                joints.append(Joint(name, parent, offset, channels, column))  # pyright: ignore
-                column += len(channels)
-            elif word == "}":
-                stack.pop()
-                k += 1
-            else:
-                raise wrong(repr(word[:40]))
-    except (IndexError, ValueError) as error:
-        if "HIERARCHY" in str(error):
-            raise
-        raise wrong(" ".join(str(error).split())[:80]) from None
-    if stack or not joints:
-        raise wrong("brackets that are not closed" if stack else "nothing")
-    return joints
-
-
-def as_bvh(tree: dict[str, Any]) -> bytes:
-    """The file of such a tree."""
-    motion = tree["motion"]
-    lines = [
-        tree["header"].rstrip() + "\nMOTION",
-        f"Frames: {len(motion)}",
-        f"Frame Time: {tree['frame_time']!r}",
-        *(" ".join(map(repr, row)) for row in motion.tolist()),
-    ]
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _plain(name: str) -> str:
@@ -223,18 +95,19 @@ def read_bvh(source: Source) -> list[Track]:
     if missing:
         bones = ", ".join(joint.name for joint in joints if joint.channels)
         raise ValueError(
-            f"the skeleton must have bones called as SMPL's, Mixamo's or CMU's: got "
+            f"the skeleton must have bones called as SMPL's, Mixamo's, CMU's or LAFAN1's: got "
             f"{source.file!r} without {', '.join(missing)}, and with {bones[:200]}; rename them"
         )
     count = next(n for n in (22, 24, 52) if all(name in SMPL_LAYOUTS[n] for name in found))
     layout = SMPL_LAYOUTS[count]
-    rest = _rest_turns(source, joints, found)
+    rest = rest_of(joints, found, lambda: _first_frame(joints, motion), source.file)
+    source.note(rest.note)
     by_joint = {k: name for name, k in found.items()}
     pose, blocks = np.zeros((len(motion), count, 3)), []
     for k, joint in enumerate(joints):
-        turns = [c for c in joint.channels if c.lower().endswith("rotation")]
+        turns = _rotations(joint)
         if k not in by_joint:
-            columns = [joint.column + joint.channels.index(c) for c in turns]
+            columns = _columns(joint, turns)
             if turns and motion[:, columns].any():
                 source.note(f"bones that SMPL does not have are left out, such as {joint.name}")
             continue
@@ -243,73 +116,42 @@ def read_bvh(source: Source) -> list[Track]:
                 f"CHANNELS of {joint.name} must hold three rotations: got {' '.join(turns)} in "
                 f"{source.file!r}"
             )
-        order = "".join(c[0].upper() for c in turns)
-        index = (slice(None), [joint.column + joint.channels.index(c) for c in turns])
+        order = _order(turns)
+        index = (slice(None), _columns(joint, turns))
         row = layout.index(by_joint[k])
-        parent = _turn_of_parent(joints, k, rest)
-        block = Block(("motion",), index, euler(order, parent.T, rest.get(k, np.eye(3))), (row,))
+        block = Block(("motion",), index, euler(order, rest.above[k], rest.turns[k]), (row,))
         pose[:, row] = block.form.decode(motion[index])
         blocks.append(block)
     time = source.tree["frame_time"]
     source.used |= {("header",), ("joints",), ("frame_time",)}
     rate = 1 / time if np.isfinite(time) and time > 1e-6 else None
     track = Track(source.stem, pose, frame_rate=rate, blocks=tuple(blocks))
-    return [_placed(source, track, joints[found["pelvis"]], motion, _height(joints))]
+    return [_placed(source, track, joints[found["pelvis"]], motion, rest.height)]
 
 
-def _turn_of_parent(joints: list[Joint], k: int, rest: dict[int, np.ndarray]) -> np.ndarray:
-    """How the rest pose of the nearest known joint above differs."""
-    parent = joints[k].parent
-    while parent >= 0 and parent not in rest:
-        parent = joints[parent].parent
-    return rest.get(parent, np.eye(3))
+def _rotations(joint: Joint) -> list[str]:
+    """The joint's channels that are rotations, in their order."""
+    return [channel for channel in joint.channels if channel.lower().endswith("rotation")]
 
 
-def _rest_turns(
-    source: Source, joints: list[Joint], found: dict[str, int]
-) -> dict[int, np.ndarray]:
-    """For each known joint, what turns SMPL's rest pose into the file's there.
-
-    Raises:
-        ValueError: they are too far apart for the bones' directions to tell.
-    """
-    turns: dict[int, np.ndarray] = {k: np.eye(3) for k in found.values()}
-    largest = 0.0
-    for name, (child, direction) in _TOWARDS.items():
-        if name not in found or child not in found:
-            continue
-        offset, k = np.zeros(3), found[child]
-        while k != found[name] and k >= 0:
-            offset, k = offset + joints[k].offset, joints[k].parent
-        length = np.linalg.norm(offset)
-        if k < 0 or not length > 0:
-            continue
-        bone = offset / length
-        cosine = float(np.clip(bone @ direction, -1, 1))
-        angle = np.degrees(np.arccos(cosine))
-        if angle > _MOST_DEGREES:
-            raise ValueError(
-                f"the skeleton must rest in a T or A pose, y up and x to its left: got "
-                f"{joints[found[name]].name} {angle:.0f} degrees off in {source.file!r}; set the "
-                "T pose as its rest pose in the program that wrote it, such as Blender"
-            )
-        axis = np.cross(direction, bone)
-        size = np.linalg.norm(axis)
-        if angle > 15.0 and size > 0:  # an A pose; less is the anatomy of the skeleton
-            largest = max(largest, angle)
-            turns[found[name]] = Rotation.from_rotvec(axis / size * np.radians(angle)).as_matrix()
-    if largest:
-        source.note(f"the skeleton's rest pose is turned into SMPL's T, by {largest:.0f} degrees")
-    return turns
+def _columns(joint: Joint, channels: list[str]) -> list[int]:
+    return [joint.column + joint.channels.index(channel) for channel in channels]
 
 
-def _height(joints: list[Joint]) -> float:
-    """From the lowest to the highest point of the skeleton at rest."""
-    places = np.zeros((len(joints), 3))
-    for k, joint in enumerate(joints):
-        above = places[joint.parent] if joint.parent >= 0 else np.zeros(3)
-        places[k] = above + joint.offset
-    return float(np.ptp(places, axis=0).max())
+def _order(turns: list[str]) -> str:
+    """The axes about which it turns, one after the other."""
+    return "".join(channel[0].upper() for channel in turns)
+
+
+def _first_frame(joints: list[Joint], motion: np.ndarray) -> list[np.ndarray]:
+    """Each joint's rotation against its parent in the first frame."""
+    found = []
+    for joint in joints:
+        turns, matrix = _rotations(joint), np.eye(3)
+        for axis, column in zip(_order(turns), _columns(joint, turns), strict=True):
+            matrix = matrix @ Rotation.from_euler(axis, motion[0, column], degrees=True).as_matrix()
+        found.append(matrix)
+    return found
 
 
 def _placed(source: Source, track: Track, root: Joint, motion: np.ndarray, height: float) -> Track:
@@ -317,7 +159,7 @@ def _placed(source: Source, track: Track, root: Joint, motion: np.ndarray, heigh
     moves = [c for c in root.channels if c.lower().endswith("position")]
     if sorted(c[0].upper() for c in moves) != ["X", "Y", "Z"]:
         return track
-    columns = [root.column + root.channels.index(c) for c in sorted(moves, key=str.upper)]
+    columns = _columns(root, sorted(moves, key=str.upper))
     unit = 1.0 if height <= _TALLEST else 0.0254 if height <= 110 and height > 50 else 0.01
     if unit != 1.0:
         name = "centimetres" if unit == 0.01 else "inches"

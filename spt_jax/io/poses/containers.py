@@ -93,7 +93,7 @@ def _opened(file: Path, content: bytes, max_bytes: int | None) -> Container:
         return Container(file, "npy", value, _as_npy)
     start = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:9]
     if start == b"HIERARCHY":
-        from spt_jax.io.poses.bvh import as_bvh, parse_bvh
+        from spt_jax.io.poses.bvh_tree import as_bvh, parse_bvh
 
         return Container(file, "bvh", parse_bvh(content, file), as_bvh)
     if start[:1] in (b"{", b"["):

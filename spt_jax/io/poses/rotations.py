@@ -3,6 +3,7 @@
 What a file holds is turned into axis-angle vectors in double precision, and back into its own form.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -150,7 +151,10 @@ def euler(order: str, before: np.ndarray, after: np.ndarray) -> Form:
 
     def encode(axis_angle: np.ndarray) -> np.ndarray:
         turned = before.T @ matrices(axis_angle.reshape(-1, 3)) @ after.T
-        angles = Rotation.from_matrix(turned).as_euler(order, degrees=True)
+        with warnings.catch_warnings():
+            # Where two axes coincide, one of many equal triples is as good as another.
+            warnings.filterwarnings("ignore", "Gimbal lock")
+            angles = Rotation.from_matrix(turned).as_euler(order, degrees=True)
         return angles.reshape(*axis_angle.shape[:-1], 3)
 
     return Form(f"Euler angles {order}", (3,), decode, encode)

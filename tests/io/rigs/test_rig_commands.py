@@ -9,7 +9,7 @@ from helpers_rigs import RigWriter, quaternion, tube
 from spt_jax import untangle_motion
 from spt_jax.cli import main as cli
 from spt_jax.io import load_poses, load_rig
-from spt_jax.io.poses.bvh import parse_bvh
+from spt_jax.io.poses.bvh_tree import parse_bvh
 from spt_jax.view import files
 
 
