@@ -72,6 +72,28 @@ def test_ranks_find_what_places_find(name, monkeypatch, rng):
             np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("name", CONTACT)
+def test_planes_through_common_corners_find_what_signs_find(name, monkeypatch, rng):
+    """To the bit, of solids turned in float32: pairs that a plane keeps apart do not intersect."""
+    vertices, faces = CONTACT[name]
+    monkeypatch.setattr(near_triangles, "_MANY", 1)
+    mesh = (vertices @ random_rotation(rng).T).astype(np.float32).astype(np.float64), faces
+    found, parted = _told(mesh), []
+    own = near_triangles.apart
+
+    def by_signs(predicates, first, second):
+        parted.append(own(predicates, first, second))
+        return np.zeros(first.shape[1], bool)
+
+    monkeypatch.setattr(near_triangles, "apart", by_signs)
+    told, volume = _told(mesh)
+    assert found[1] == volume
+    for one, other in zip(found[0], told, strict=True):
+        np.testing.assert_array_equal(one, other)
+    if name in ("a side in common", "four sides in one plane"):
+        assert np.concatenate(parted).mean() > 0.5
+
+
 def test_solids_that_touch_are_told_apart_before_any_sign_is_asked_for(monkeypatch):
     """The price of contact: pairs across the lattice's boxes are left to nobody."""
     asked = []

@@ -17,6 +17,7 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.triangles.common_corners import apart, are_common
 from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
 from spt_jax.overlap.triangles.fans import around_vertices, facing
 from spt_jax.overlap.triangles.pair_boxes import (
@@ -183,6 +184,11 @@ class NearTriangles:
 
     def _straddling(self, t, u):
         corners, count = self.layout.corners, self._predicates.points.shape[1]
+        if len(t) >= _MANY:
+            pair = corners.take(t, axis=1), corners.take(u, axis=1)
+            if are_common(self._predicates, *pair):
+                kept = np.flatnonzero(~apart(self._predicates, *pair))
+                t, u = t[kept], u[kept]
         for turn in (0, 1):
             x, y = (t, u) if turn else (u, t)
             plane, corner = corners.take(y, axis=1), corners.take(x, axis=1)

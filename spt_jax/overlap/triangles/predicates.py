@@ -100,8 +100,14 @@ class Predicates:
         """
         found = np.empty(self.points.shape, np.int64)
         for place, push, rank in zip(self.points, self.push, found, strict=True):
-            order = np.lexsort((push, place))
-            new = (np.diff(place[order]) != 0) | (np.diff(push[order]) != 0)
+            order = np.argsort(place)
+            higher = np.append(True, np.diff(place[order]) != 0)
+            alone = higher & np.append(higher[1:], True)
+            # By push only where places are the same: sorting by both takes three times as long.
+            tied = np.flatnonzero(~alone)
+            some = order[tied]
+            order[tied] = some[np.lexsort((push[some], np.cumsum(higher)[tied]))]
+            new = higher[1:] | (np.diff(push[order]) != 0)
             rank[order] = np.append(0, np.cumsum(new))[: len(order)]
         return found
 
