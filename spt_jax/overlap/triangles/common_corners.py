@@ -74,7 +74,10 @@ def apart(predicates: Predicates, first: Int[np.ndarray, "3 N"], second) -> Bool
 def _alike(points, first, second):
     """(3, 3, N), which corners of the first triangle lie in which places of the second's."""
     p, q = points.take(first, axis=1), points.take(second, axis=1)
-    return (p[:, :, None] == q[:, None]).all(axis=0)
+    alike = p[0][:, None] == q[0]
+    for k in (1, 2):
+        alike &= p[k][:, None] == q[k]
+    return alike
 
 
 def _from(corners, chosen):

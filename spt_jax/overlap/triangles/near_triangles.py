@@ -108,16 +108,16 @@ class NearTriangles:
         """
         if self._left is not None:
             return self._still(self._left)
-        few = self._predicates.points.shape[1] < STEPS
-        found, self._near = self._found(self._by_place(), few)
+        found, self._near = self._found(self._by_place(), by_rank=False)
         if self._near is None:
-            return self._found(self._by_rank(), False)[0]
+            return self._found(self._by_rank(), by_rank=True)[0]
         return found
 
     def _still(self, left: Left) -> Pairs:
         """The same of what an earlier shape left to look at."""
         self._limit(left.pairs.shape[1])
-        found = [self._straddling(*left.pairs[:, part]) for part in pieces(left.pairs.shape[1], 1)]
+        parts = (left.pairs[:, part] for part in pieces(left.pairs.shape[1], 1))
+        found = [self._straddling(*self._parted(*part)) for part in parts]
         a, b = left.groups
         if len(a):
             layout = left.layout
@@ -126,7 +126,7 @@ class NearTriangles:
             across = across_groups(layout, shape, clusters, [(a, b)])
             for t, u in parts_of_size(chain(within, across)):
                 t, u, _ = not_apart(left.layout, shape, t, u, 0.0)
-                found.append(self._straddling(t, u))
+                found.append(self._straddling(*self._parted(t, u)))
         return found
 
     @cached_property
@@ -155,18 +155,21 @@ class NearTriangles:
         across = across_groups(layout, shape, clusters, groups)
         return parts_of_size(chain(within_clusters(layout, shape), across))
 
-    def _found(self, pairs, if_few_touch: bool):
+    def _found(self, pairs, by_rank: bool):
         """The straddling ones, and those with a corner in the other's plane; None if given up."""
         found, near, seen = [], [], 0
-        shape = self._boxes[1]
+        shape, few = self._boxes[1], self._predicates.points.shape[1] < STEPS
         for t, u in pairs:
-            if if_few_touch and len(t) >= _MANY and touching_share(shape, t, u) > _TOUCHING:
+            if by_rank:
+                # Nobody asks which corners lie in planes, so what common corners tell comes first.
+                t, u = self._parted(t, u)
+            elif few and len(t) >= _MANY and touching_share(shape, t, u) > _TOUCHING:
                 return found, None
             t, u, in_plane = self._not_apart(t, u)
             near.append(in_plane)
             seen += len(t)
             self._limit(seen)
-            found.append(self._straddling(t, u))
+            found.append(self._straddling(*((t, u) if by_rank else self._parted(t, u))))
         return found, near
 
     def _limit(self, seen: int) -> None:
@@ -182,13 +185,16 @@ class NearTriangles:
     def _not_apart(self, t, u):
         return not_apart(*self._boxes[:2], t, u, self._reach)
 
+    def _parted(self, t, u):
+        """The pairs without those that a plane through common corners keeps apart."""
+        corners = [self.layout.corners.take(x, axis=1) for x in (t, u)]
+        if len(t) < _MANY or not are_common(self._predicates, *corners):
+            return t, u
+        kept = np.flatnonzero(~apart(self._predicates, *corners))
+        return t[kept], u[kept]
+
     def _straddling(self, t, u):
         corners, count = self.layout.corners, self._predicates.points.shape[1]
-        if len(t) >= _MANY:
-            pair = corners.take(t, axis=1), corners.take(u, axis=1)
-            if are_common(self._predicates, *pair):
-                kept = np.flatnonzero(~apart(self._predicates, *pair))
-                t, u = t[kept], u[kept]
         for turn in (0, 1):
             x, y = (t, u) if turn else (u, t)
             plane, corner = corners.take(y, axis=1), corners.take(x, axis=1)
