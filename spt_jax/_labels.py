@@ -123,7 +123,9 @@ def classify_vertices(
         backend: as in `self_intersection_penalty`.
 
     Returns:
-        The labels; every vertex is clear where the penalty is NaN.
+        The labels. Beside an open sheet, where the penalty is NaN, solids are labelled as without
+        it, and the sheet's vertices are penetrating where they lie in a solid. Where the penalty is
+        NaN otherwise every vertex is clear.
 
     Raises:
         TypeError, ValueError: as `self_intersection_penalty`.

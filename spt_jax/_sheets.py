@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Integer
+from jaxtyping import Array, Float, Int8, Integer
 
 from spt_jax._mesh_check import one_mesh
 from spt_jax._penalty import Known, differentiable
@@ -13,6 +13,7 @@ from spt_jax._query import as_choice, as_faces, as_vertices
 from spt_jax._result import Result
 from spt_jax.bridge.reverse_only import refuse_forward
 from spt_jax.overlap.host_functions import SheetOptions, SheetValue
+from spt_jax.overlap.labels import CLEAR, PENETRATING
 from spt_jax.overlap.sheets import SheetInSolids
 from spt_jax.overlap.vectors import area_normals
 
@@ -109,6 +110,11 @@ class SheetReport(Result):
     deepest: int
     depths: Float[np.ndarray, "V"]
     intersecting_pairs: int
+
+    @property
+    def labels(self) -> Int8[np.ndarray, "V"]:
+        """1 for vertices in a solid, penetrating, and 0 for clear ones; as `classify_vertices`."""
+        return np.where(self.depths > 0, PENETRATING, CLEAR).astype(np.int8)
 
     @property
     def is_free(self) -> bool:

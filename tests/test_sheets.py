@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from helpers import body_faces, box, embedded_body, inverted, join, random_rotation, sphere
 
-from spt_jax import sheet_penalty, sheet_report
+from spt_jax import RestSurface, classify_vertices, sheet_penalty, sheet_report
 from spt_jax.overlap.sheets import SheetInSolids
 
 EPS = float(np.finfo(np.float64).eps)
@@ -132,3 +132,32 @@ def test_what_is_no_solid_is_refused():
     assert np.isnan(sheet_penalty(vertices * np.nan, faces, *sphere(subdivisions=1)))
     with pytest.raises(ValueError, match="batch axes must broadcast"):
         sheet_penalty(np.stack([vertices] * 2), faces, np.stack([vertices] * 3), faces)
+
+
+def test_vertices_of_sheets_are_labelled_by_where_they_lie(rng):
+    """Solids as without the sheet, whatever is excluded; the sheet by whether it is in a solid."""
+    first, second, sheet = box(), box(), grid(7, 1.7)
+    second = (second[0] + [0.7, 0.1, 0.2], second[1])
+    mixed = rng.permutation(len(sheet[1]) + 24)
+    whole = join(join(first, sheet), second)
+    vertices, faces = whole[0], whole[1][mixed]
+    solid = np.r_[:8, len(vertices) - 8 : len(vertices)]
+    alone = classify_vertices(*join(first, second)).labels
+    found = np.asarray(classify_vertices(vertices, faces).labels)
+    np.testing.assert_array_equal(found[solid], alone)
+    assert np.any(alone)
+    inside = [
+        (np.abs(sheet[0] - centre) < 0.5).all(axis=1) for centre in ([0, 0, 0], [0.7, 0.1, 0.2])
+    ]
+    np.testing.assert_array_equal(found[8:-8], inside[0] | inside[1])
+    report = sheet_report(*sheet, *join(first, second))
+    np.testing.assert_array_equal(report.labels, found[8:-8])
+    # Between the solids nothing counts; the sheet is where it is.
+    group = np.array([0] * 12 + [1] * len(sheet[1]) + [2] * 12)[mixed]
+    ignored = classify_vertices(vertices, faces, face_groups=group, ignore_groups=((0, 2),)).labels
+    assert not np.asarray(ignored)[solid].any()
+    np.testing.assert_array_equal(np.asarray(ignored)[8:-8], found[8:-8])
+    rest = RestSurface(vertices, faces, 0.01)  # in which the solids overlap
+    at_rest = np.asarray(classify_vertices(vertices, faces, rest_surface=rest).labels)
+    assert not at_rest[solid].any() and at_rest[8:-8].any()
+    assert not np.asarray(classify_vertices(*sheet).labels).any()

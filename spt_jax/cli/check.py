@@ -18,6 +18,7 @@ from spt_jax.cli.terminal import (
 
 def check(
     mesh: tyro.conf.Positional[Path],
+    solids: Path | None = None,
     rays: int | None = None,
     max_bytes: int | None = None,
     json: bool = False,
@@ -31,6 +32,9 @@ def check(
 
     Args:
         mesh: the file, such as body.ply, body.obj, body.stl or body.glb.
+        solids: a file of closed meshes beside an open one, such as a body under a garment: how much
+            of the garment lies in them is reported, and how deep, in place of what it does to
+            itself.
         rays: how many rays to cast along the longer side of each of three beams; not given: none,
             everything is measured exactly.
         max_bytes: what the file and its arrays may take; not given: 1 GiB.
@@ -47,7 +51,11 @@ def check(
         "intersection": None,
     }
     try:
-        code, shown = _judge(mesh, rays, max_bytes, found)
+        code, shown = (
+            _judge(mesh, rays, max_bytes, found)
+            if solids is None
+            else _judge_sheet(mesh, solids, rays, max_bytes, found)
+        )
     except CommandError as error:
         if not json:
             raise
@@ -96,3 +104,32 @@ def _judge(
             "as they are; please report the file"
         )
     return int(not report.is_free), [checked, report, verdict]
+
+
+def _judge_sheet(
+    path: Path, solids: Path, rays: int | None, max_bytes: int | None, found: dict[str, Any]
+) -> tuple[int, list[Any]]:
+    from spt_jax._mesh_check import check_mesh
+    from spt_jax._sheets import sheet_report
+    from spt_jax.io.mesh_files import open_mesh
+
+    with user_errors():
+        if rays is not None:
+            raise ValueError("rays cannot be cast at an open mesh: got them with solids.")
+        sheet, body = (open_mesh(file, max_bytes=max_bytes) for file in (path, solids))
+    found["solids"] = str(solids)
+    found["notes"] = [*sheet.notes, *(f"{solids.name}: {note}" for note in body.notes)]
+    checked = check_mesh(body.vertices, body.faces)
+    found["mesh"] = checked.as_dict()
+    if not checked.ok:
+        why = f"[red]{solids.name} cannot be judged before that is put right[/red]"
+        return 2, [checked, why]
+    with measurable(path.name):
+        report = sheet_report(sheet.vertices, sheet.faces, body.vertices, body.faces)
+    found["intersection"] = report.as_dict()
+    verdict = (
+        f"[green]nothing of it lies in {solids.name}[/green]"
+        if report.is_free
+        else f"[red]it reaches into {solids.name}[/red]"
+    )
+    return int(not report.is_free), [report, verdict]

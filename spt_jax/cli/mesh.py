@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from spt_jax.cli.terminal import (
     err_console,
@@ -20,6 +20,7 @@ from spt_jax.cli.terminal import (
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from spt_jax.io.meshes.reading import MeshFile
     from spt_jax.untangle.mesh import UntangleMeshResult
 
 # Text formats keep every digit, and .ply holds either precision; .glb and .stl hold float32, so the
@@ -33,14 +34,21 @@ def untangle_mesh_file(
     path: Path,
     out: Path,
     *,
+    fixed: Path | None = None,
     meshes: bool,
     rays: int | None,
     max_bytes: int | None = None,
     json: bool,
     quiet: bool,
 ) -> int:
-    """Untangle one mesh; the exit code is 0 if it is intersection-free, and 1 otherwise."""
-    from spt_jax._mesh_check import check_mesh
+    """Untangle one mesh; the exit code is 0 if it is intersection-free, and 1 otherwise.
+
+    Args:
+        path: the mesh that moves.
+        out: folder for the results.
+        fixed: a mesh that stays as it is, and that the other one is freed from, too.
+        meshes, rays, max_bytes, json, quiet: as the command has them.
+    """
     from spt_jax._query import as_rays
     from spt_jax.files.outputs import ensure_folder, write_json
     from spt_jax.io.mesh_files import open_mesh
@@ -48,11 +56,14 @@ def untangle_mesh_file(
     with user_errors():
         as_rays(rays)
         opened = open_mesh(path, max_bytes=max_bytes)
-        vertices, faces = opened.vertices, opened.faces
-        check_mesh(vertices, faces).raise_if_unfit()
-        given, suffix, notes = _as_stored(vertices, path.suffix.lower())
+        given, suffix, notes = _as_stored(opened.vertices, path.suffix.lower())
+        beside = None if fixed is None else open_mesh(fixed, max_bytes=max_bytes)
+        given, faces, stays = _together(given, opened.faces, beside)
         folder = ensure_folder(out)
+    own = len(opened.vertices)
     notes = [*opened.notes, *notes]
+    if beside is not None:
+        notes += [f"{beside.path.name}: {note}" for note in beside.notes]
     for note in notes:
         show(err_console(quiet), f"note: {note}", "yellow")
     start = time.perf_counter()
@@ -67,22 +78,23 @@ def untangle_mesh_file(
         # Half the rays, as for poses: the last intersections do not hang on them.
         sampling: dict[str, Any] = {} if rays is None else {"rays": max(rays // 2, 1)}
         with measurable(path.name):
-            result = untangle_mesh(given, faces, on_step=on_step, **sampling)
+            result = untangle_mesh(given, faces, fixed=stays, on_step=on_step, **sampling)
         seconds = time.perf_counter() - start
         state("writing", done=1)
         report: dict[str, Any] = {
             "command": "untangle",
-            "settings": {"mesh": str(path), "directions": 3, **sampling},
+            "settings": {"mesh": str(path), "directions": 3, **sampling}
+            | ({} if fixed is None else {"fixed": str(fixed)}),
             **result.as_dict(),
             "seconds": round(seconds, 3),
             "notes": notes,
         }
         with user_errors():
             report["mesh"] = f"{path.stem}_untangled{suffix}"
-            written = opened.write(folder / report["mesh"], result.vertices)
+            written = opened.write(folder / report["mesh"], result.vertices[:own])
             report["notes"] = [*notes, *written]
             report["meshes"] = (
-                _write_colored(folder, path.stem, given, result.vertices, faces, rays)
+                _write_colored(folder, path.stem, given, result.vertices, faces, own, rays)
                 if meshes
                 else []
             )
@@ -113,6 +125,28 @@ def untangle_mesh_file(
             "red",
         )
     return 0 if result.is_free else 1
+
+
+def _together(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], beside: "MeshFile | None"
+) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"], Bool[np.ndarray, "W"] | None]:
+    """A mesh and behind it one that stays, and which vertices that are.
+
+    Raises:
+        ValueError: a mesh that cannot be measured; the message names what is wrong.
+    """
+    from spt_jax._mesh_check import check_mesh
+
+    if beside is None:
+        check_mesh(vertices, faces).raise_if_unfit()
+        return vertices, faces, None
+    try:
+        check_mesh(beside.vertices, beside.faces).raise_if_unfit()
+    except ValueError as error:
+        raise ValueError(f"fixed must be a mesh of closed solids: {beside.path}: {error}") from None
+    both = np.concatenate([vertices, beside.vertices.astype(vertices.dtype)])
+    stays = np.arange(len(both)) >= len(vertices)
+    return both, np.concatenate([faces, beside.faces + len(vertices)]), stays
 
 
 def _as_stored(
@@ -167,14 +201,33 @@ def _write_colored(
     before: Float[np.ndarray, "V 3"],
     after: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
+    own: int,
     rays: int | None,
 ) -> list[str]:
-    from spt_jax._report import intersection_report
     from spt_jax.io.mesh_files import write_mesh
 
     names = []
     for when, vertices in (("before", before), ("after", after)):
         names.append(f"{stem}_{when}.glb")
-        labels = intersection_report(vertices, faces, rays=rays).labels
+        labels = _labels(vertices, faces, own, rays)
         write_mesh(folder / names[-1], vertices, faces, labels)
     return names
+
+
+def _labels(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    own: int,
+    rays: int | None,
+) -> Int[np.ndarray, "V"]:
+    """Labels of a mesh, whose first vertices move; of a garment by where it lies in the others."""
+    from spt_jax._labels import classify_vertices
+    from spt_jax._mesh_check import check_mesh
+    from spt_jax._sheets import sheet_report
+
+    moves = faces[:, 0] < own
+    body = faces[~moves] - own
+    if len(body) and check_mesh(vertices[:own], faces[moves]).largest_hole is not None:
+        labels = sheet_report(vertices[:own], faces[moves], vertices[own:], body).labels
+        return np.concatenate([labels, np.zeros(len(vertices) - own, labels.dtype)])
+    return np.asarray(classify_vertices(vertices, faces, rays=rays).labels)

@@ -28,6 +28,7 @@ def untangle(
     meshes: bool = False,
     like_input: bool = False,
     together: bool = False,
+    fixed: Path | None = None,
     frame_by_frame: bool = False,
     fps: float | None = None,
     up: str = "auto",
@@ -53,7 +54,8 @@ def untangle(
     back into the same file, NAME_untangled.glb, as one more animation, and as .npz and .bvh.
 
     Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
-    in the same format; the exit code is 1 if something still intersects or overlaps.
+    in the same format; the exit code is 1 if something still intersects or overlaps. With --fixed
+    BODY a garment, open or closed, is freed from a body that stays as it is.
 
     Args:
         poses: the pose file (.npz, .npy, .pkl, .pt, .json, .bvh), a rig or a mesh file.
@@ -76,6 +78,9 @@ def untangle(
         together: the people of a file as one scene: freed of themselves and of each other; what is
             between and within them is counted apart. Frame by frame, people are moved as a whole,
             too; in a motion they stay where they are.
+        fixed: of a mesh, another mesh file that stays where it is, such as the body under a
+            garment; the first mesh is moved out of it. An open mesh is a garment: what it does to
+            itself is not looked at.
         frame_by_frame: free each frame by itself, as single poses are.
         fps: frames a second; not given: those of the file, or 30.
         up: the axis that is up, by which standing feet are told: x, y, z, -x, -y, -z; "auto": the
@@ -96,6 +101,7 @@ def untangle(
         with user_errors():
             _refuse(
                 "a rig",
+                fixed=fixed is not None,
                 like_input=like_input,
                 together=together,
                 body=body != "anny",
@@ -137,7 +143,14 @@ def untangle(
                 anew=anew,
             )
         return untangle_mesh_file(
-            poses, out, meshes=meshes, rays=rays, max_bytes=max_bytes, json=json, quiet=quiet
+            poses,
+            out,
+            fixed=fixed,
+            meshes=meshes,
+            rays=rays,
+            max_bytes=max_bytes,
+            json=json,
+            quiet=quiet,
         )
     from spt_jax._exclusions import as_fold_distance
     from spt_jax._query import as_rays
@@ -150,6 +163,7 @@ def untangle(
     with user_errors():
         as_rays(rays)
         as_fold_distance(fold_distance)
+        _refuse("a pose file", fixed=fixed is not None)
         asked = chosen(poses, people, frames, max_bytes)
         if together and like_input:
             raise ValueError(
@@ -234,4 +248,5 @@ def untangle(
 def _refuse(what: str, **used: bool) -> None:
     for name, given in used.items():
         if given:
-            raise ValueError(f"{name} is for pose files: got it with {what}; leave it out.")
+            of = "meshes" if name == "fixed" else "pose files"
+            raise ValueError(f"{name} is for {of}: got it with {what}; leave it out.")

@@ -17,12 +17,14 @@ from spt_jax.overlap.inflation import Inflated
 from spt_jax.overlap.measure import (
     Gradient,
     Measurement,
+    OpenSheets,
     Rule,
     Sampling,
     Unmeasurable,
     check_usable,
     measure,
 )
+from spt_jax.overlap.sheet_labels import labels_beside_sheets
 from spt_jax.overlap.sheets import SheetInSolids
 
 SheetValue = Literal["area", "depth"]
@@ -95,7 +97,10 @@ def labels_on_host(
 ) -> tuple[Int8[np.ndarray, "V"]]:
     """The label of each vertex; all are clear where the mesh cannot be measured."""
     try:
-        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        try:
+            found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+        except OpenSheets:
+            return (labels_beside_sheets(vertices, faces, *options),)
         return (found.labels(options.rule),)
     except Unmeasurable:
         return (np.zeros(len(vertices), np.int8),)

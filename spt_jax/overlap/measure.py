@@ -45,6 +45,10 @@ class Unmeasurable(ValueError):
     """A mesh has no surface that could be measured; the message says why."""
 
 
+class OpenSheets(Unmeasurable):
+    """It has a part that is an open sheet, which encloses nothing."""
+
+
 class Sampling(NamedTuple):
     """How a mesh is measured: exactly (`rays=None`) or by rays, and the directions of the beams."""
 
@@ -263,15 +267,15 @@ def measure(
         rounding: machine epsilon of the numbers that the vertices came in.
 
     Raises:
+        OpenSheets: a hole that is too large to be closed.
         Unmeasurable: a coordinate that is not finite, a face out of range, coordinates whose cubes
-            overflow or vanish, a hole that is too large to be closed, a mesh so far from the origin
-            that rounding has eaten its shape, or so crumpled that its intersections are too many to
-            be listed.
+            overflow or vanish, a mesh so far from the origin that rounding has eaten its shape, or
+            so crumpled that its intersections are too many to be listed.
     """
     check_usable(vertices, faces, rounding)
     reason = open_sheets(manifold_of(faces, len(vertices)), vertices)
     if reason is not None:
-        raise Unmeasurable(reason)
+        raise OpenSheets(reason)
     found = Measurement(vertices, faces, sampling, exclusions, rounding)
     if sampling.rays is None or exclusions.any:
         _ = found.surface  # rays alone need none
