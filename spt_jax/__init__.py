@@ -52,6 +52,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.keypoints import keypoint_regressor as keypoint_regressor
     from spt_jax.keypoints import read_keypoints as read_keypoints
     from spt_jax.rest.surface import RestSurface as RestSurface
+    from spt_jax.untangle.contacts import find_contacts as find_contacts
     from spt_jax.untangle.mesh import UntangleMeshResult as UntangleMeshResult
     from spt_jax.untangle.mesh import untangle_mesh as untangle_mesh
     from spt_jax.untangle.motion import MotionResult as MotionResult
@@ -94,6 +95,7 @@ __all__ = [
     "clear_caches",
     "config",
     "contact_penalty",
+    "find_contacts",
     "fit_people",
     "fit_pose",
     "inflate",
@@ -155,6 +157,7 @@ __getattr__, __dir__ = _lazy_names(
         "Step": "spt_jax._steps",
         "UntangleMeshResult": "spt_jax.untangle.mesh",
         "UntangleResult": "spt_jax.untangle.pose",
+        "find_contacts": "spt_jax.untangle.contacts",
         "fit_people": "spt_jax.fit.people",
         "fit_pose": "spt_jax.fit.pose",
         "keypoint_regressor": "spt_jax.keypoints",

@@ -17,9 +17,8 @@ Patch = Integer[np.ndarray, "_"] | Sequence[int]
 
 
 class _Known(NamedTuple):
-    """What stays the same, hashable: the faces, and how many pairs there are."""
+    """What stays the same, hashable: how many pairs there are."""
 
-    faces: bytes
     pairs: int
 
 
@@ -76,17 +75,21 @@ def contact_penalty(
             "faces, not an argument of the function that is traced."
         )
     corners = np.asarray(as_faces(faces, vertices.shape[-2]), np.int64)
-    rows = as_rows(pairs, len(corners))
-    return contact_of_rows(vertices, corners, rows, len(pairs), as_margin(margin))
+    rows = as_rows(pairs, corners)
+    return contact_of_rows(vertices, rows, len(pairs), as_margin(margin))
 
 
-def as_rows(pairs: Sequence[tuple[Any, Any]], num_faces: int) -> Int[np.ndarray, "R 3"]:
-    """Patches as rows of pair, side and face.
+def as_rows(
+    pairs: Sequence[tuple[Any, Any]], faces: Int[np.ndarray, "F 3"]
+) -> Int[np.ndarray, "N 3"]:
+    """Patches as rows: of each of their triangles pair, side and 0, and then the corners of each.
+
+    All of it in one array of rows of three, as the bridge takes faces, so that it may be traced.
 
     Raises:
         TypeError, ValueError: as `contact_penalty`.
     """
-    rows = [np.zeros((0, 3), np.int64)]
+    rows, num_faces = [np.zeros((0, 2, 3), np.int64)], len(faces)
     for number, pair in enumerate(pairs):
         if isinstance(pair, Tracer) or len(pair) != 2:
             raise ValueError(
@@ -112,32 +115,31 @@ def as_rows(pairs: Sequence[tuple[Any, Any]], num_faces: int) -> Int[np.ndarray,
                     f"faces in pair {number}; numbers are 0-based."
                 )
             at = np.unique(found)
-            rows.append(np.stack([np.full(len(at), number), np.full(len(at), side), at], axis=1))
-    return np.concatenate(rows)
+            which = np.broadcast_to([number, side, 0], (len(at), 3))
+            rows.append(np.stack([which, faces[at]], axis=1))
+    return np.concatenate(np.concatenate(rows).transpose(1, 0, 2))
 
 
 def contact_of_rows(
     vertices: Float[Array, "*batch V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    rows: Int[np.ndarray, "R 3"] | Array,
+    rows: Integer[np.ndarray, "R 3"] | Integer[Array, "R 3"],
     pairs: int,
-    margin: float,
+    margin: float | Float[Array, " K"],
 ) -> Float[Array, "*batch"]:
     """`contact_penalty` of patches as rows, which may be traced.
 
     Args:
         vertices: positions.
-        faces: of the mesh.
-        rows: pair, side (0 or 1) and face; rows with a pair of -1 are padding.
+        rows: of `as_rows`; triangles of a pair of -1 are padding.
         pairs: how many pairs there are at most.
-        margin: the distance at which patches touch.
+        margin: the distance at which patches touch, one or one for each pair.
     """
     dtype = vertices.dtype.name
-    known = _Known(faces.astype(np.int64).tobytes(), pairs)
+    known = _Known(pairs)
     results = (((pairs, 2), "int32"), ((pairs, 2, 3), dtype), ((pairs,), dtype))
     places, weights, apart = call_on_host(_nearest_on_host, known, results, vertices, rows)
     weights, apart = jax.lax.stop_gradient((weights, apart))
-    corners = jnp.asarray(faces)[places]  # (..., pairs, 2, 3)
+    corners = jnp.asarray(rows)[len(rows) // 2 :][places]  # (..., pairs, 2, 3)
     batch = vertices.shape[:-2]
     flat = vertices.reshape(-1, *vertices.shape[-2:])
     taken = jax.vmap(lambda one, at: one[at])(flat, corners.reshape(len(flat), pairs, 2, 3))
@@ -147,20 +149,21 @@ def contact_of_rows(
     touching = apart <= 0  # or no such pair; NaN where it cannot be told
     square = jnp.sum(way**2, axis=-1)
     distance = jnp.sqrt(jnp.where(touching | (square == 0), jnp.ones_like(square), square))
-    over = jnp.where(touching, jnp.zeros_like(distance), jnp.maximum(distance - margin, 0.0))
+    limit = jnp.broadcast_to(jnp.asarray(margin, dtype), distance.shape)
+    over = jnp.where(touching, jnp.zeros_like(distance), jnp.maximum(distance - limit, 0.0))
     over = jnp.where(jnp.isnan(apart), apart, over)
     return jnp.sum(over**2, axis=-1).reshape(batch)
 
 
 def _nearest_on_host(vertices, rows, known: _Known):
-    """Of each pair of patches the faces, the weights and the distance; -1 where there is none."""
-    faces = np.frombuffer(known.faces, np.int64).reshape(-1, 3)
+    """Of each pair of patches the rows, the weights and the distance; -1 where there is none."""
+    which, faces = np.split(rows.astype(np.int64), 2)
     places = np.zeros((known.pairs, 2), np.int32)
     weights = np.zeros((known.pairs, 2, 3))
     apart = np.full(known.pairs, -1.0)
     for pair in range(known.pairs):
-        own = rows[rows[:, 0] == pair]
-        first, second = (own[own[:, 1] == side, 2] for side in (0, 1))
+        own = which[:, 0] == pair
+        first, second = (np.flatnonzero(own & (which[:, 1] == side)) for side in (0, 1))
         if not len(first) or not len(second):
             continue
         corners = faces[np.concatenate([first, second])]

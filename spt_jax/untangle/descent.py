@@ -20,6 +20,7 @@ from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 from spt_jax.untangle.contact_solver import ContactSolver
+from spt_jax.untangle.contacts import Held, contact_cost
 
 Folds = Literal["ignore", "remove", "count"]
 
@@ -51,6 +52,7 @@ class Search(eqx.Module):
     tolerance: float = eqx.field(static=True)
     rest: RestSurface | None = eqx.field(static=True)
     solver: optx.AbstractMinimiser
+    contacts: Held | None = None
 
     @property
     def measured_rays(self) -> Rays:
@@ -145,7 +147,10 @@ def _objective(search: Search, moved, arguments):
         margin=margin,
         rest_surface=search.rest,
     )
-    return jnp.sum(moved**2) + weight * volume / CENTIMETRE**3
+    cost = jnp.sum(moved**2) + weight * volume / CENTIMETRE**3
+    if search.contacts is None:
+        return cost
+    return cost + contact_cost(vertices, search.contacts, margin)
 
 
 @program

@@ -1,6 +1,7 @@
 """Remove a posed body's self-intersections by moving its joints."""
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from spt_jax._contact import as_rows
 from spt_jax._exclusions import as_fold_surface
 from spt_jax._query import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
 from spt_jax._result import Overlap, Result, plain
@@ -17,6 +19,8 @@ from spt_jax._steps import OnStep
 from spt_jax.body import AbstractBody
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable
 from spt_jax.overlap.rays.beam import Rays
+from spt_jax.rest.surface import RestSurface
+from spt_jax.untangle.contacts import held_contacts, is_found
 from spt_jax.untangle.descent import (
     SOLVER,
     Folds,
@@ -30,6 +34,7 @@ from spt_jax.untangle.descent import (
     vertices_of,
 )
 from spt_jax.untangle.mesh import untangle_checked
+from spt_jax.untangle.motion_input import as_positive
 from spt_jax.untangle.sides import other_side
 from spt_jax.untangle.spread import Surface
 
@@ -96,6 +101,9 @@ def untangle_pose(
     steps_per_weight: int = 25,
     tolerance: float = 1e-9,
     solver: optx.AbstractMinimiser | None = None,
+    contacts: Any = None,
+    contact_distance: float = 0.02,
+    contact_weight: float = 20.0,
     on_step: OnStep | None = None,
 ) -> UntangleResult:
     """The pose nearest to the one given in which no body parts collide, as far as it goes.
@@ -136,6 +144,13 @@ def untangle_pose(
             intersect; the default is 1 mm^3.
         solver: an optimistix minimiser; by default `contact_solver.ContactSolver`, which asks for
             the overlap a quarter as often as `optimistix.BFGS` (benchmarks/results.md).
+        contacts: contact that is to be kept, hands that clap or arms that are crossed: pairs of
+            patches as `contact_penalty` takes them, or "found", those of `find_contacts` in the
+            pose given. Pairs within `contact_distance` of each other in the pose given are held as
+            near as they were, or at the margin where they were nearer or intersected.
+        contact_distance: in metres.
+        contact_weight: what the squared distance of a pair beyond that weighs, in cm^2, against the
+            squared displacement; 0 lets contacts go.
         on_step: called with a `spt_jax.Step` after each step of the solver; what it raises ends the
             search. The solver's loop then runs in Python.
 
@@ -152,9 +167,9 @@ def untangle_pose(
             shape or translation that is not finite or does not fit pose's batch axes; no weights,
             or weights that are not positive and finite; steps_per_weight not positive; more than
             2048 rays, or fewer than one; an unknown way with folds; margin or fold_distance
-            negative or not finite; directions as in `self_intersection_penalty`;
-            `spt_jax.overlap.measure.Unmeasurable` for a pose given in which the body has no surface
-            that could be measured.
+            negative or not finite; another word for contacts; directions as in
+            `self_intersection_penalty`; `spt_jax.overlap.measure.Unmeasurable` for a pose given in
+            which the body has no surface that could be measured.
         TypeError: pose traced; rays, margin, fold_distance or directions that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
@@ -210,17 +225,34 @@ def untangle_pose(
         solver=solver or SOLVER,
         rest=rest,
     )
+    wanted = _Contacts(
+        contacts,
+        as_positive("contact_distance", contact_distance, zero=True),
+        as_positive("contact_weight", contact_weight, zero=True),
+        rest,
+    )
+    if contacts is not None and not is_found(contacts):
+        as_rows(contacts, faces_of(body))  # refused before anything is searched
     poses = list(map(jnp.asarray, np.asarray(pose).reshape(-1, *one)))
     shapes = _per_pose("shape", shape, batch, len(poses))
     translations = _per_pose("translation", translation, batch, len(poses))
     surface = Surface(np.asarray(body.faces), body.num_vertices) if way == "remove" else None
     found = [
-        _untangle_one(search, surface, body, *one, on_step)
+        _untangle_one(search, surface, body, *one, wanted, on_step)
         for one in zip(poses, shapes, translations, strict=True)
     ]
     if not found:
         raise ValueError(f"pose must hold at least one pose: got shape {pose.shape}.")
     return jax.tree.map(lambda *leaves: _stacked(leaves, batch), *found)
+
+
+class _Contacts(NamedTuple):
+    """What contact is to be kept."""
+
+    contacts: Any
+    distance: float
+    weight: float
+    rest: RestSurface | None
 
 
 def _stacked(leaves: tuple[Array | np.ndarray, ...], batch: tuple[int, ...]) -> Array:
@@ -249,6 +281,7 @@ def _untangle_one(
     pose: Array,
     shape: Array | None,
     translation: Array | None,
+    wanted: "_Contacts",
     on_step: OnStep | None,
 ) -> UntangleResult:
     vertices, faces = vertices_of(body, pose, shape, translation), faces_of(body)
@@ -256,6 +289,9 @@ def _untangle_one(
     best, after, steps = pose, before, 0
     ended, diverged = RESULTS.successful, False
     if not search.is_free(before):
+        if wanted.contacts is not None:
+            held = held_contacts(body, before.vertices, *wanted, dtype=pose.dtype)
+            search = replace(search, contacts=held)
         factor = displacement_factor(body, pose, shape)
         moved = jnp.asarray(np.zeros(factor.shape[:1], pose.dtype))
         idle = 0

@@ -37,6 +37,7 @@ NAMES = [
     "clear_caches",
     "config",
     "contact_penalty",
+    "find_contacts",
     "fit_people",
     "fit_pose",
     "inflate",
@@ -85,7 +86,8 @@ PARAMETERS = {
     "untangle_pose": "body, pose, *, shape=None, translation=None, folds='ignore',"
     " fold_distance=None, margin=0.002,"
     " rays=None, directions=3, weights=(0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),"
-    " steps_per_weight=25, tolerance=1e-09, solver=None, on_step=None",
+    " steps_per_weight=25, tolerance=1e-09, solver=None, contacts=None, contact_distance=0.02,"
+    " contact_weight=20.0, on_step=None",
 }
 # Their docstrings say what there is to say without a list of results.
 SHORT = {
