@@ -2,7 +2,8 @@
 
 The hand is the embedded body's left one, cut at the wrist as MANO's is, so that a fan closes it.
 Its poses are the colliding ones of the tests' library, and some of them closed further; two hands
-are a scene of two such hands whose fingers pass through each other. Whether a finger is left within
+are a scene of it and of the right hand that is its mirror image, whose fingers pass through each
+other. Whether a finger is left within
 another is not for us to say: `oracles.py` lists the edges that pass through triangles farther away
 along the rest surface than a crease of that finger reaches.
 """
@@ -80,6 +81,22 @@ def left_hand() -> BodyModel:
     )
 
 
+@cache
+def two_hands() -> BodyGroup:
+    """The left hand and its mirror image, the right one."""
+    left = left_hand()
+    mirror = jnp.array([-1.0, 1.0, 1.0])
+    right = left.replaced(
+        {
+            "template": left.template * mirror,
+            "joint_template": left.joint_template * mirror,
+            "faces": left.faces[:, ::-1],
+            "joint_names": tuple(name.replace("left", "right") for name in left.joint_names),
+        }
+    )
+    return BodyGroup([left, right])
+
+
 def poses() -> dict[str, np.ndarray]:
     """By name, the hand's poses."""
     names = [name.removeprefix("left_") for name in left_hand().joint_names]
@@ -95,21 +112,15 @@ def poses() -> dict[str, np.ndarray]:
 
 def pairs() -> dict[str, np.ndarray]:
     """By name, poses of two hands that face each other, fingers through fingers."""
-    hand = left_hand()
+    hand, group, found = left_hand(), two_hands(), {}
     length = float(np.asarray(hand.template)[:, 0].max())
-    group, found = BodyGroup(hand, 2), {}  # type: ignore
     for reach, turn, across in _PAIRS:
         second = np.zeros((2, len(hand.joint_names), 3), np.float32)
-        second[1, 0] = _facing(turn)
+        second[1, 0] = turn, 0.0, 0.0
         place = np.array([[0, 0, 0], [2 * length - reach, 0, across]], np.float32)
         name = f"two hands, {100 * reach:.0f} cm into each other, turned by {np.rad2deg(turn):.0f}"
         found[name] = np.asarray(group.pose_of(second, place))
     return found
-
-
-def _facing(turn: float) -> np.ndarray:
-    """Half a turn about y and then a turn about x, as axis-angle: half a turn about (0, c, s)."""
-    return np.pi * np.array([0.0, np.cos(turn / 2), np.sin(turn / 2)])
 
 
 @cache
@@ -130,7 +141,8 @@ def freed(name: str, body, pose: np.ndarray, count: int) -> Case:
     """One pose of so many hands, untangled and judged."""
     hand = left_hand()
     faces = np.asarray(body.faces, np.int64)
-    rest = np.concatenate([np.asarray(hand.template, np.float64)] * count)
+    own = [np.asarray(one.template, np.float64) for one in getattr(body, "everyone", [body])]
+    rest = np.concatenate(own)
     graph = RestGraph.of(rest, faces, np.tile(hand.rest_surface.distances, count))
     vertices = np.asarray(body(jnp.asarray(pose)).vertices, np.float64)
     start = time.process_time()
@@ -201,8 +213,7 @@ def main(settings: Settings) -> None:
     """Untangle all hands, print the tables, and record them where that is asked for."""
     hand = left_hand()
     one = [freed(name, hand, pose, 1) for name, pose in poses().items()]
-    group = BodyGroup(hand, 2)  # type: ignore
-    two = [freed(name, group, pose, 2) for name, pose in pairs().items()]
+    two = [freed(name, two_hands(), pose, 2) for name, pose in pairs().items()]
     parts = [*tables(one, "One hand"), *tables(two, "Two hands")]
     for table in parts:
         table.print()

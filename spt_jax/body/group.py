@@ -1,8 +1,10 @@
-"""Several people of one body model as one body, so that they are freed together."""
+"""Several people, or two hands, as one body, so that they are freed together."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -14,18 +16,24 @@ from spt_jax.rest.surface import RestSurface
 
 
 class BodyGroup(AbstractBody):
-    """`count` people of one body model, as one body with one surface.
+    """`count` people of one body model, or bodies of one family, as one body with one surface.
+
+    `BodyGroup(body, 2)` is two people of one model, `BodyGroup([left, right])` a left and a right
+    hand, or a man and a woman: models with the same numbers of joints, vertices and shape
+    coefficients.
 
     A pose is (count * (J + 1), 3): of each person first the J rows of its own pose, then a row that
     says where the person is, in metres. Freed together (`untangle_pose`), people turn all joints
     but their roots, and move. Shapes follow each other, too: (count * B).
 
     Attributes:
-        body: whose people they are.
-        count: how many.
+        bodies: the different models.
+        which: of each person, which of these.
 
     Raises:
-        ValueError: no people; a body whose poses are not rotations of joints.
+        TypeError: a count with a list of bodies, or none with one body.
+        ValueError: no people; a body whose poses are not rotations of joints; bodies that differ in
+            their numbers of joints, vertices or shape coefficients.
 
     Example:
         >>> import jax.numpy as jnp
@@ -38,26 +46,66 @@ class BodyGroup(AbstractBody):
         ((106, 3), (24544, 3))
     """
 
-    body: AbstractBody
-    count: int = eqx.field(static=True)
+    bodies: tuple[AbstractBody, ...]
+    which: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, body: AbstractBody | Sequence[AbstractBody], count: int | None = None):
+        alone = isinstance(body, AbstractBody)
+        if alone != (count is not None):
+            raise TypeError(
+                "body must be one body with a count, or a list of bodies without: got "
+                f"{'one body' if alone else 'a list'} and count {count!r}."
+            )
+        if isinstance(body, AbstractBody):
+            if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+                raise ValueError(f"count must be a positive whole number: got {count!r}.")
+            everyone = [body] * int(count)
+        else:
+            everyone = list(body)
+        if not everyone:
+            raise ValueError("body must be a body, or a list of at least one: got an empty list.")
+        kinds = {id(one): one for one in everyone}
+        places = {key: k for k, key in enumerate(kinds)}
+        self.bodies = tuple(kinds.values())
+        self.which = tuple(places[id(one)] for one in everyone)
 
     def __check_init__(self):
-        if self.count < 1:
-            raise ValueError(f"count must be a positive whole number: got {self.count}.")
-        if not self.body.pose_is_rotations:
+        sizes = {(one.pose_shape, one.num_vertices, one.num_shape) for one in self.bodies}
+        if len(sizes) > 1:
+            raise ValueError(
+                "bodies must have the same numbers of joints, vertices and shape coefficients: got "
+                f"{', '.join(f'{p[0]}, {v:,} and {s}' for p, v, s in sorted(sizes))}."
+            )
+        if not all(one.pose_is_rotations for one in self.bodies):
             raise ValueError("body must have a pose that is rotations of joints, (J, 3).")
+
+    @property
+    def count(self) -> int:
+        """How many people."""
+        return len(self.which)
+
+    @property
+    def body(self) -> AbstractBody:
+        """The first person's model."""
+        return self.bodies[self.which[0]]
+
+    @property
+    def everyone(self) -> list[AbstractBody]:
+        """Each person's model."""
+        return [self.bodies[k] for k in self.which]
 
     @property
     def faces(self) -> Int[Array, "F 3"]:
         """Triangles of all people, one after the other."""
-        step = jnp.arange(self.count, dtype=jnp.int32)[:, None, None] * self.body.num_vertices
-        faces = jnp.broadcast_to(self.body.faces, (self.count, *self.body.faces.shape))
-        return (faces + jnp.broadcast_to(step, faces.shape)).reshape(-1, 3)
+        step = self.body.num_vertices
+        own = [jnp.asarray(one.faces) + k * step for k, one in enumerate(self.everyone)]
+        return jnp.concatenate(own)
 
     @property
     def face_groups(self) -> Int[np.ndarray, "F"]:
         """Of each face, whose it is."""
-        return np.repeat(np.arange(self.count, dtype=np.int32), len(self.body.faces))
+        numbers = [len(one.faces) for one in self.everyone]
+        return np.repeat(np.arange(self.count, dtype=np.int32), numbers)
 
     @property
     def within(self) -> Pairs:
@@ -72,18 +120,24 @@ class BodyGroup(AbstractBody):
     @property
     def weights(self) -> Float[Array, "V J"]:
         """Skinning weights of all people."""
-        return jnp.kron(jnp.eye(self.count, dtype=self.body.weights.dtype), self.body.weights)
+        return jax.scipy.linalg.block_diag(*(one.weights for one in self.everyone))
 
     @property
     def parents(self) -> tuple[int, ...]:
         """The parents of all people's joints; each has a root."""
-        joints, own = self.body.num_joints, self.body.parents
-        return tuple(p + k * joints if p >= 0 else -1 for k in range(self.count) for p in own)
+        joints = self.body.num_joints
+        return tuple(
+            p + k * joints if p >= 0 else -1
+            for k, one in enumerate(self.everyone)
+            for p in one.parents
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """The names of all people's joints, each with its person's number."""
-        return tuple(f"{k} {name}" for k in range(self.count) for name in self.body.joint_names)
+        return tuple(
+            f"{k} {name}" for k, one in enumerate(self.everyone) for name in one.joint_names
+        )
 
     @property
     def num_vertices(self) -> int:
@@ -115,7 +169,16 @@ class BodyGroup(AbstractBody):
     @property
     def rest_surface(self) -> RestSurface:
         """That of the body, for each person: between people there are no folds."""
-        return self.body.rest_surface.copies(self.count)
+        if len(self.bodies) == 1:
+            return self.body.rest_surface.copies(self.count)
+        surfaces = [one.rest_surface for one in self.everyone]
+        vertices, start = [], 0.0
+        for one in self.everyone:  # side by side, so that nothing lies in another at rest
+            rest = np.asarray(one(jnp.zeros(one.pose_shape)).vertices, np.float64)
+            vertices.append(rest + np.array([start - rest[:, 0].min(), 0.0, 0.0]))
+            start = vertices[-1][:, 0].max() + np.ptp(rest)
+        distances = np.concatenate([surface.distances for surface in surfaces])
+        return RestSurface(np.concatenate(vertices), self.faces, distances)
 
     def pose_of(
         self,
@@ -139,7 +202,8 @@ class BodyGroup(AbstractBody):
         """Each person as a group of one, with its pose and shape: what moves one moves no other."""
         rows = pose.reshape(self.count, -1, 3)
         shapes = [None] * self.count if shape is None else shape.reshape(self.count, -1)
-        return [(BodyGroup(self.body, 1), rows[k], shapes[k]) for k in range(self.count)]
+        people = [BodyGroup(one, 1) for one in self.everyone]
+        return list(zip(people, rows, shapes, strict=True))
 
     def __call__(
         self,
@@ -175,8 +239,18 @@ class BodyGroup(AbstractBody):
             whole = floating("translation", translation).astype(given.dtype)[..., None, :]
             common = jnp.broadcast_shapes(places.shape, whole.shape)
             places = jnp.broadcast_to(places, common) + jnp.broadcast_to(whole, common)
-        found = self.body(poses, shapes, places)
-        return PosedBody(*(x.reshape(*x.shape[:-3], -1, 3) for x in found))
+        if len(self.bodies) == 1:
+            found = self.body(poses, shapes, places)
+            return PosedBody(*(x.reshape(*x.shape[:-3], -1, 3) for x in found))
+        each = [
+            one(
+                poses[..., k, :, :],
+                None if shapes is None else shapes[..., k, :],
+                places[..., k, :],
+            )
+            for k, one in enumerate(self.everyone)
+        ]
+        return PosedBody(*(jnp.concatenate(x, axis=-2) for x in zip(*each, strict=True)))
 
     def at_vertices(self, indices: Any) -> "BodyGroup":
         """The same people with some of their vertices only: those of the first, in each of them.
@@ -185,4 +259,5 @@ class BodyGroup(AbstractBody):
             TypeError, ValueError: as `BodyModel.at_vertices`, for the first person's.
         """
         rows = checked_rows(indices, self.body.num_vertices)
-        return BodyGroup(self.body.at_vertices(rows), self.count)
+        kept = [one.at_vertices(rows) for one in self.bodies]
+        return BodyGroup([kept[k] for k in self.which])

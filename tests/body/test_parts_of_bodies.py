@@ -85,3 +85,46 @@ def test_a_head_of_flame_is_a_body(whole, tmp_path):
     pose = np.zeros((5, 3), np.float32)
     pose[3:] = 0.3, -0.4, 0.0
     assert found_in(head, head(pose).vertices).is_free
+
+
+def test_a_left_and_a_right_hand_are_a_group(hand):
+    mirror = np.array([-1.0, 1.0, 1.0], np.float32)
+    right = hand.replaced(
+        {
+            "template": jnp.asarray(np.asarray(hand.template) * mirror),
+            "joint_template": jnp.asarray(np.asarray(hand.joint_template) * mirror),
+            "faces": hand.faces[:, ::-1],
+            "joint_names": tuple(name.replace("left", "right") for name in hand.joint_names),
+            "hands": (),
+            "pose_basis": None,
+        }
+    )
+    left = hand.replaced({"hands": (), "pose_basis": None})
+    pair = BodyGroup([left, right])
+    rng = np.random.default_rng(5)
+    poses = rng.normal(scale=0.2, size=(3, 2, 16, 3)).astype(np.float32)
+    places = rng.normal(size=(3, 2, 3)).astype(np.float32)
+    posed = pair(pair.pose_of(poses, places))
+    own = [one(poses[:, k], None, places[:, k]) for k, one in enumerate((left, right))]
+    np.testing.assert_allclose(
+        posed.vertices, np.concatenate([one.vertices for one in own], axis=1), atol=1e-6
+    )
+    # A mirrored pose is that of the mirrored hand.
+    other = right(poses[:, 0] * np.array([1, -1, -1], np.float32)).vertices
+    np.testing.assert_allclose(other, np.asarray(left(poses[:, 0]).vertices) * mirror, atol=1e-5)
+    assert pair.joint_names[0] != pair.joint_names[16] and pair.joint_names[16][0] == "1"
+    assert pair.parents[16] == -1 and pair.weights.shape == (pair.num_vertices, 32)
+    apart = pair(
+        pair.pose_of(np.zeros((2, 16, 3), np.float32), np.float32([[0, 0, 0], [1, 0, 0]]))
+    ).vertices
+    report = found_in(pair, apart)
+    assert report.is_free and report.solid_volume > 0 and len(report.holes) == 2
+    some = pair.at_vertices([3, 5])
+    np.testing.assert_allclose(
+        some(pair.pose_of(poses, places)).vertices[:, 2], own[1].vertices[:, 3], atol=1e-6
+    )
+    assert [one.bodies for one, _, _ in pair.alone(np.zeros((34, 3)), None)] == [(left,), (right,)]
+    with pytest.raises(ValueError, match="same numbers of joints"):
+        BodyGroup([left, left.at_vertices([1])])
+    with pytest.raises(TypeError, match="a list of bodies without: got one body"):
+        BodyGroup(left)
