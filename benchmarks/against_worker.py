@@ -188,7 +188,7 @@ class Calls:
 
 
 def main() -> None:
-    """Answer each line with [milliseconds, [numbers that tell the result], the processor's]."""
+    """Answer each line with [milliseconds, [numbers that identify the result], the processor's]."""
     if not str(spt_jax.__file__).startswith(sys.argv[1]):
         sys.exit(f"spt_jax must be imported from {sys.argv[1]}: got {spt_jax.__file__}.")
     if hasattr(spt_jax, "config"):  # before its first release, processes were always started

@@ -2,9 +2,9 @@
 
     python -m benchmarks.datasets [--files 6] [--record]
 
-Throughput is told by processor time: how much of it the same files take where one process works,
-and where two do side by side. On a machine that others use as well, wall time says how many these
-are.
+Throughput is measured by processor time: how much of it the same files take where one process
+works, and where two do side by side. On a machine that others use as well, wall time says how many
+these are.
 """
 
 import json

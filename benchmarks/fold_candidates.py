@@ -48,7 +48,7 @@ class Pieces(NamedTuple):
 
 
 def judged_of(overlap: ExactOverlap) -> Judged:
-    """What was judged by contours: there is something wherever folds are told."""
+    """The regions that contours decide; there are some wherever folds are excluded."""
     judged = overlap.judged
     if judged is None:
         raise ValueError("the overlap must be judged by a rest surface: got one of whole parts.")

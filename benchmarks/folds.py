@@ -1,4 +1,4 @@
-"""Whether folds are told from collisions, and how well: `python -m benchmarks.folds`.
+"""Whether folds are distinguished from collisions, and how well: `python -m benchmarks.folds`.
 
 The oracle looks at triangles alone (`oracles.py`): a frame collides where an edge crosses a
 triangle that is farther along the rest surface than what lies there may fold, 0.3 m on trunk and
@@ -230,7 +230,12 @@ def hand_table() -> Table:
                 right[name].setdefault(kind, []).append(volume)
     return Table(
         "41 poses of a hand: verdicts against ipctk's crossings of more than 5 cm",
-        ("distances", "collide, and count", "do not, and do not count", "median volume, cm^3"),
+        (
+            "distances",
+            "collide, and are included",
+            "do not, and are excluded",
+            "median volume, cm^3",
+        ),
         [
             (
                 name,

@@ -110,7 +110,7 @@ def _tried(topic: Topic, seed: int, number: int) -> Case:
 
 
 def _serve(topic: Topic, seed: int, pipe: Any) -> None:
-    """A process that tries what it is told to, and answers case by case."""
+    """A process that runs the cases it is sent and answers case by case."""
     # The first cases, of every format, import and compile what the limit is not meant for.
     for number in range(len(FORMATS) if topic == "files" else 1):
         _tried(topic, seed, number)
@@ -174,7 +174,7 @@ def _log(settings: Settings, cases: Iterable[Case]) -> None:
 
 
 def _logged(settings: Settings) -> list[Case]:
-    """The cases of this seed in the log; a last line that was being written does not count."""
+    """The cases of this seed in the log; a last line that was cut off is ignored."""
     if settings.log is None or not settings.log.exists():
         return []
     text = settings.log.read_text()

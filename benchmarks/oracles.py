@@ -1,9 +1,10 @@
 """Which parts of a posed body cross, exactly and slowly: `python -m benchmarks.oracles --out FILE`.
 
 An edge that passes through a triangle is a self-intersection beyond doubt, and how far apart the
-two are along the rest surface tells a fold at a joint from a collision of body parts. Nothing here
-uses rays: the crossings are ipctk's, the distances scipy's. How far apart is far depends on where:
-of each pair of triangles the smaller of their two distances, which for trunk and limbs are 0.3 m.
+two are along the rest surface distinguishes a fold at a joint from a collision of body parts.
+Nothing here uses rays: the crossings are ipctk's, the distances scipy's. How far apart is far
+depends on where: of each pair of triangles the smaller of their two distances, which for trunk and
+limbs are 0.3 m.
 """
 
 from dataclasses import dataclass, field

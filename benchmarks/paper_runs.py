@@ -1,4 +1,4 @@
-"""The descents of the paper's sections 4.1 and 4.2, which `paper_figures` draws and tells of.
+"""The descents of the paper's sections 4.1 and 4.2, which `paper_figures` draws and reports.
 
 "Plain gradient descent" is `pose - rate * gradient`, jitted, over every pose parameter, the global
 orientation included; shape fixed, 512 x 512 rays along one direction, the paper's rate 1e-4.

@@ -34,7 +34,7 @@ OPTIONS = PenaltyOptions(
 
 
 class Finding(NamedTuple):
-    """Whether a law holds, and the figure by which that is told."""
+    """Whether a law holds, and the figure by which that is decided."""
 
     met: bool
     figure: str

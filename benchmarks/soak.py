@@ -305,7 +305,7 @@ def growth_of(samples: list[Sample]) -> float:
 
 
 def main(settings: Settings) -> int:
-    """Run, print and perhaps record; what is wrong is told on standard error."""
+    """Run, print and perhaps record; what is wrong is printed to standard error."""
     jobs, samples, before, after = soaked(settings)
     growth = growth_of(samples)
     mega = lambda count: f"{count / 1e6:.0f} MB"  # noqa: E731

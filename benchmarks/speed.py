@@ -37,7 +37,7 @@ def milliseconds(
 ) -> tuple[float, float, float]:
     """The 10, 50 and 90 % points of the call's time, after one call that compiles.
 
-    What was measured is forgotten before each call, unless it is to be asked `again`.
+    Cached results are dropped before each call, unless it is to be asked `again`.
     """
     jax.block_until_ready(call())
     times = []

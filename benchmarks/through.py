@@ -2,9 +2,9 @@
 
 100 poses (`through_poses.py`): arms through the torso, legs through each other, hands and arms
 through the head. `untangle_pose` sees the pose alone. Whether what it finds is free of collisions
-is told by ipctk; whether the limb is on the right side, the one that moves the body least, by all
-poses known to be free: what it found, and what a descent finds that starts from the pose from which
-the limb came.
+is checked by ipctk; whether the limb is on the right side, the one that moves the body least, by
+all poses known to be free: what it found, and what a descent finds that starts from the pose from
+which the limb came.
 """
 
 import multiprocessing

@@ -3,7 +3,7 @@
 Each motion at its own rate and interpolated to four times that, as splines of rotations; sequences
 with other shapes made from them; and scenes of two people. Whether a frame is free is ipctk's to
 say (`oracles.py`), of 30 frames a second, in scenes the package's own; how smooth a motion is, is
-told by the second differences of its skin's vertices.
+measured by the second differences of its skin's vertices.
 """
 
 import multiprocessing

@@ -162,7 +162,7 @@ class PinholeCamera(eqx.Module):
         lies between telephones (65 to 70) and portrait lenses (25 to 40), and is not far from the
         habit of taking the image's diagonal for the focal length (45 over the longer side of
         3 : 2). The habit of 5000 pixels, 12 degrees or less, puts people 20 to 60 m away, where no
-        perspective is left to tell an arm in front from one behind. For an image cut out of
+        perspective is left to distinguish an arm in front from one behind. For an image cut out of
         another, take the whole one's width and height, and move the center.
 
         Args:

@@ -146,7 +146,7 @@ def contact_of_rows(
     points = (weights.reshape(len(flat), pairs, 2, 3)[..., None] * taken).sum(axis=-2)
     way = points[:, :, 1] - points[:, :, 0]
     apart = apart.reshape(len(flat), pairs)
-    touching = apart <= 0  # or no such pair; NaN where it cannot be told
+    touching = apart <= 0  # or no such pair; NaN where it cannot be determined
     square = jnp.sum(way**2, axis=-1)
     distance = jnp.sqrt(jnp.where(touching | (square == 0), jnp.ones_like(square), square))
     limit = jnp.broadcast_to(jnp.asarray(margin, dtype), distance.shape)

@@ -1,4 +1,4 @@
-"""The arguments that say which overlaps do not count: groups of faces, and a rest surface."""
+"""The arguments that say which overlaps are excluded: groups of faces, and a rest surface."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from spt_jax.rest.surface import RestSurface
 def as_exclusions(
     face_groups: Any, ignore_groups: Any, rest_surface: Any, faces: Any
 ) -> Exclusions:
-    """Which overlaps do not count, as a hashable object.
+    """Which overlaps are excluded, as a hashable object.
 
     Raises:
         TypeError: traced groups; groups that are not whole numbers; a rest_surface of another type.

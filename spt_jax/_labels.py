@@ -117,7 +117,7 @@ def classify_vertices(
         directions: 1, 3 or the rows of a D x 3 array: for the triangle rule, which takes a label
             seen along any of them.
         rule: "vertex" or "triangle", as above.
-        face_groups, ignore_groups, rest_surface: overlaps that do not count, as in
+        face_groups, ignore_groups, rest_surface: excluded overlaps, as in
             `self_intersection_penalty`; their vertices are clear. Those of an overlap that counts
             in part are not.
         backend: as in `self_intersection_penalty`.

@@ -28,8 +28,9 @@ class MeshCheck:
         boundary_edges: edges of one face only.
         holes: loops of boundary edges; loops that touch at a vertex are one.
         largest_hole: the loop that is largest beside the part around it: its `edges`, `length` and
-            `size`, the area of a disk with such a rim against that of the part. Up to 0.75 a fan to
-            the mean of its vertices closes it; no flat sheet has less than 1, a hemisphere 0.5.
+            `size`, the area of a disk with that perimeter against that of the part. Up to 0.75 a
+            fan to the mean of its vertices closes it; no flat sheet has less than 1, a hemisphere
+            0.5.
         open_sheets: connected parts with a loop that is too large to be closed.
         misoriented_edges: edges that both of their two faces run through in the same sense.
         nonmanifold_edges: edges of more than two faces.

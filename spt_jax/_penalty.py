@@ -69,7 +69,7 @@ def self_intersection_penalty(
     Args:
         vertices: positions of one mesh or of a batch that shares its faces, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside. The mesh
-            must be closed and consistently wound (`check_mesh` tells); it need not be connected.
+            must be closed and consistently wound (see `check_mesh`); it need not be connected.
             Holes are closed by a fan to the mean of their boundary's vertices, if they are small
             beside the part around them (`check_mesh`); an open sheet encloses nothing: NaN.
         value: "volume", in the cube of the unit, or "ratio", the paper's Eq. 11: the part of the
@@ -93,7 +93,7 @@ def self_intersection_penalty(
             apart. Concave creases narrower than the margin fold when moved, and count.
         face_groups: a whole number for each triangle: its body part or person
             (`body.part_groups`, `join_bodies`).
-        ignore_groups: pairs of groups whose overlaps do not count, such as ((0, 0), (1, 1)) for
+        ignore_groups: pairs of groups whose overlaps are excluded, such as ((0, 0), (1, 1)) for
             "only between the two people". Between groups that are closed by themselves that is
             exact at any depth: what is within and what is between add up to the whole, to
             rounding. Groups that are parts of one surface are judged by
@@ -103,23 +103,23 @@ def self_intersection_penalty(
             on fingers) are a fold of the skin, made by bending. An overlap region counts by the
             fraction of its intersection contour's length that is not a fold: entirely for two
             limbs, not at all for the crease of an elbow. The fraction is differentiated too. Parts
-            that are enclosed in each other at rest, as eyeballs in a head, do not count. None:
+            that are enclosed in each other at rest, as eyeballs in a head, are excluded. None:
             every overlap counts.
         backend: "numpy": on the host; "xla", or `spt_jax.xla.Xla` with the sizes of its
             arrays: in JAX alone, where the vertices are; "auto": "numpy", also where JAX runs on a
-            GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and tells
-            folds and groups by what the rays meet (`spt_jax.xla`; `python -m benchmarks.device`
-            prints how far off it is).
+            GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and
+            decides folds and groups by what the rays meet (`spt_jax.xla`; `python -m
+            benchmarks.device` prints how far off it is).
         second_order: whether the volume has its own second derivatives, and forward mode. They are
             exact wherever the volume has them: everywhere but where surfaces touch. A product with
             the Hessian costs a fifth of the gradient that it comes with, with a margin as much as
             that (`python -m benchmarks.second_order`). Only for the exact volume and gradient.
 
     Returns:
-        One number per mesh, in the vertices' dtype. A volume that the dtype cannot tell from zero
-        is zero, with a zero gradient. NaN, with a zero gradient, where value or gradient are more
-        than the dtype can hold, or there is no surface to measure: a vertex is not finite, a traced
-        face is out of range, the mesh is smaller than 1024 units in the last place of its
+        One number per mesh, in the vertices' dtype. A volume that the dtype cannot distinguish from
+        zero is zero, with a zero gradient. NaN, with a zero gradient, where value or gradient are
+        more than the dtype can hold, or there is no surface to measure: a vertex is not finite, a
+        traced face is out of range, the mesh is smaller than 1024 units in the last place of its
         coordinates, or so crumpled that more than 20 pairs of triangles to a triangle (and
         2,000,000) are near each other.
 

@@ -20,9 +20,9 @@ class IntersectionReport(Result):
     """How much of a mesh is in self-intersection; printing it shows a table.
 
     Attributes:
-        volume: the overlap volume that counts, in the cube of the mesh's unit: the mean over the
+        volume: the included overlap volume, in the cube of the mesh's unit: the mean over the
             directions.
-        total_volume: the same with what does not count: folds and ignored groups.
+        total_volume: the same including folds and ignored groups.
         solid_volume: what the surface encloses, each overlap counted as often as it is covered:
             the integral of the winding number.
         directions: of the beams, unit vectors.
@@ -31,7 +31,7 @@ class IntersectionReport(Result):
         labels: +1 penetrating, -1 inverted, 0 clear, as from `classify_vertices`.
         intersecting_pairs: the number of face pairs that intersect and count; faces that only touch
             do not intersect.
-        total_intersecting_pairs: the same with what does not count.
+        total_intersecting_pairs: the same including folds and ignored groups.
         rays: as requested: None (exact), rays along the longer side of each screen, or
             (rows, columns).
         crossings: of rays with triangles, for each beam; none where no rays were needed.
@@ -39,7 +39,7 @@ class IntersectionReport(Result):
             not to close, which no closed mesh has been seen to do: then 512 rays are cast.
         holes: the boundary loops that were closed by fans to the mean of their vertices, the
             largest first: how many edges each has, its length, and its size, the area of a disk
-            with such a rim against that of the part around it.
+            with that perimeter against that of the part around it.
 
     Example:
         >>> import trimesh
@@ -86,7 +86,7 @@ class IntersectionReport(Result):
 
     @property
     def is_free(self) -> bool:
-        """Whether no faces intersect and no parts overlap, where that counts."""
+        """Whether no faces intersect and no parts overlap, apart from what is excluded."""
         return not (self.intersecting_pairs or self.volume > 0)
 
     def as_dict(self) -> dict[str, Any]:
@@ -159,14 +159,14 @@ def intersection_report(
 
     The numbers are those of `self_intersection_penalty` and `classify_vertices`, measured in
     float64 whatever the dtype of the vertices. Where rays are cast, the spread between directions
-    tells the error of the volume. Holes are closed, and listed; `check_mesh` says more of them.
+    shows the error of the volume. Holes are closed and listed; `check_mesh` says more about them.
 
     Args:
         vertices: positions of one mesh, in any unit.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
         rays, directions: as in `self_intersection_penalty`.
         rule: how the vertices are labelled, as in `classify_vertices`.
-        face_groups, ignore_groups, rest_surface: what does not count, as in
+        face_groups, ignore_groups, rest_surface: what is excluded, as in
             `self_intersection_penalty`.
 
     Returns:

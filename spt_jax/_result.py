@@ -44,10 +44,10 @@ class Overlap(Result):
     """How much of a surface is in self-intersection.
 
     Attributes:
-        volume: the overlap volume that counts, in the cube of the unit: without folds, unless they
+        volume: the included overlap volume, in the cube of the unit: without folds, unless they
             count.
         total_volume: the same with folds.
-        ratio: the fraction of the vertices in overlaps that count (paper, Eq. 11).
+        ratio: the fraction of the vertices in included overlaps (paper, Eq. 11).
         intersecting_pairs: the number of face pairs that intersect and count; faces that only touch
             do not intersect.
         total_intersecting_pairs: the same with folds.
@@ -71,7 +71,7 @@ class Overlap(Result):
 
     @property
     def is_free(self) -> Bool[np.ndarray, "*batch"] | bool:
-        """Whether no faces intersect and no parts overlap, where that counts."""
+        """Whether no faces intersect and no parts overlap, apart from what is excluded."""
         free = (np.asarray(self.intersecting_pairs) == 0) & ~(np.asarray(self.volume) > 0)
         return free if free.ndim else bool(free)
 

@@ -44,7 +44,7 @@ class Step:
 
     @property
     def volume(self) -> float:
-        """The overlap volume that counts, in the cube of the unit; NaN if it cannot be measured."""
+        """The included overlap volume, in the cube of the unit; NaN if it cannot be measured."""
         return self._measured[0]
 
     @property

@@ -37,11 +37,11 @@ class MotionOverlap(Result):
     """How much of a surface is in self-intersection, frame by frame.
 
     Attributes:
-        volume: of each frame, the overlap volume that counts, in the cube of the unit.
-        ratio: the fraction of the vertices in overlaps that count (paper, Eq. 11).
+        volume: of each frame, the included overlap volume, in the cube of the unit.
+        ratio: the fraction of the vertices in included overlaps (paper, Eq. 11).
         intersecting_pairs: the number of face pairs that intersect and count.
         largest_depth: how far the deepest vertex lies inside another part, in the unit; parts that
-            fold there do not count, also where the overlap goes on into one that does.
+            fold there are excluded, also where the region continues into a collision.
         mean_depth: the mean of that over all vertices inside another part; 0 without any.
 
     Example:
@@ -61,7 +61,7 @@ class MotionOverlap(Result):
 
     @property
     def is_free(self) -> Bool[np.ndarray, "T"]:
-        """Of each frame, whether no faces intersect and no parts overlap, where that counts."""
+        """Of each frame, whether nothing intersects or overlaps, apart from what is excluded."""
         return (self.intersecting_pairs == 0) & ~(self.volume > 0)
 
     @property
@@ -163,7 +163,7 @@ def motion_overlap(
     Args:
         vertices: positions in each frame, in any unit; the public criterion takes it for metres.
         faces: indices of each triangle's corners, counter-clockwise seen from outside.
-        face_groups, ignore_groups, rest_surface: what does not count, as in
+        face_groups, ignore_groups, rest_surface: what is excluded, as in
             `self_intersection_penalty`.
 
     Returns:

@@ -71,7 +71,7 @@ class AbstractBody(eqx.Module):
     @property
     @abstractmethod
     def rest_surface(self) -> RestSurface:
-        """The body's surface at rest: what the penalty tells folds by."""
+        """The body's surface at rest, by which the penalty recognizes folds."""
 
     @property
     def num_joints(self) -> int:
@@ -98,7 +98,7 @@ class AbstractBody(eqx.Module):
         """Of each face, the joint that moves it most (`joint_names` says which).
 
         By the mean skinning weight over its corners. With `ignore_groups=body.neighbor_pairs`,
-        overlaps of parts that meet at a joint do not count.
+        overlaps of parts that meet at a joint are excluded.
 
         Raises:
             TypeError: as `rest_surface`.

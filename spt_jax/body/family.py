@@ -95,7 +95,7 @@ def body_of(
 
 
 def _what_it_is(names: Sequence[str]) -> str:
-    """What a file without a model's arrays is, as far as their names tell."""
+    """What a file without a model's arrays is, as far as the names of its arrays show."""
     known = set(names)
     if known & {"poses", "pose", "body_pose", "global_orient", "pose_body", "root_orient"}:
         return "It is a file of poses: load_poses reads it."

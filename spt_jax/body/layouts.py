@@ -1,4 +1,4 @@
-"""The models whose files are read, told apart by what is in them, and the names of their joints."""
+"""The models whose files are read, how files are recognized, and the names of the joints."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -53,7 +53,7 @@ _LAYOUTS = (
     Layout("SMAL", _SMAL),
     Layout("SUPR", tuple(f"joint{k}" for k in range(75)), "quaternions"),
 )
-"""All that are known; of two with one number of joints the pose blend shapes tell which."""
+"""All known models; of two with the same number of joints, the pose blend shapes decide."""
 
 
 def layout_of(arrays: Mapping[str, np.ndarray], path: Path) -> Layout:

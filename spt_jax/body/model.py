@@ -104,7 +104,7 @@ class BodyModel(AbstractBody):
 
     @property
     def rest_surface(self) -> RestSurface:
-        """The body's surface at rest, in the mean shape: what the penalty tells folds by.
+        """The body's surface at rest, in the mean shape, by which the penalty recognizes folds.
 
         Triangles that intersect nearer to each other along it than what lies there allows fold:
         0.3 m on trunk and limbs, 4 to 5 cm on fingers, from the girth of what each joint moves

@@ -111,7 +111,7 @@ class RigModel(AbstractBody):
 
     @property
     def rest_surface(self) -> RestSurface:
-        """The surface in the bind pose: what the penalty tells folds by.
+        """The surface in the bind pose, by which the penalty recognizes folds.
 
         As `BodyModel.rest_surface`; for a character of another size than a human one the distances
         are in proportion to the largest extent of its bind pose, 0.3 m for 1.8 m.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
-# Accelerators multiply float32 matrices in fewer bits unless told otherwise; a millimetre is lost.
+# Accelerators multiply float32 matrices in fewer bits unless asked otherwise; a millimeter is lost.
 _EXACT = jax.lax.Precision.HIGHEST
 
 

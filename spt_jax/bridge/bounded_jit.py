@@ -1,4 +1,4 @@
-"""`jax.jit` that forgets: programs of shapes that are no longer asked for are given back."""
+"""`jax.jit` with a bounded cache: programs of shapes that are no longer used are released."""
 
 import functools
 import threading
@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-# How many different calls are compiled before all are forgotten. A program takes 1 to 5 MB.
+# How many different calls are compiled before all are dropped. A program takes 1 to 5 MB.
 _MOST = 64
 
 
 class BoundedJit:
-    """A jitted function that starts anew after so many different calls.
+    """A jitted function that drops its programs after so many different calls.
 
     JAX keeps 4,096 programs of a function, or for ever what other caches refer to: some
     gigabytes where every call brings another shape.
@@ -45,7 +45,7 @@ class BoundedJit:
         return len(self._seen)
 
     def clear(self) -> None:
-        """Forget all programs."""
+        """Drop all programs."""
         with self._lock:
             self._reset()
 
@@ -56,6 +56,6 @@ class BoundedJit:
         def anew(static: Any, *arrays: Any) -> Any:
             return function(static, *arrays)
 
-        # A function of its own: JAX's caches, also those of what is derived from it, end with it.
+        # A new function: JAX's caches, also those of functions derived from it, are freed with it.
         self._seen: set[Any] = set()
         self._jitted: Any = jax.jit(anew, static_argnums=0)

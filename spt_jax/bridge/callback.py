@@ -105,7 +105,7 @@ def call_on_host(
 
 
 def clear_results() -> None:
-    """Forget what was measured, for those who time it."""
+    """Drop the cached results, so that a benchmark measures anew."""
     on_host.clear_results()
 
 

@@ -107,12 +107,12 @@ _workers = Workers()
 
 
 def clear_results() -> None:
-    """Forget what was measured."""
+    """Drop the cached results."""
     _result_cache.clear()
 
 
 def release() -> None:
-    """Give back what is kept between calls: results, other processes and threads."""
+    """Release everything that is kept between calls: results, other processes and threads."""
     _result_cache.clear_all()
     _workers.release()
 

@@ -222,7 +222,7 @@ def select_people(names: Sequence[str], images: Sequence[str], wanted: str) -> l
 
 
 def _image_names(images: Sequence[str | int | None], path: Path) -> list[str]:
-    """A name for each person's image: without folder and suffix, where that is told apart."""
+    """A name for each person's image: without folder and suffix, if those are unique."""
     short = {
         image: path.stem
         if image is None

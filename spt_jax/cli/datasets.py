@@ -66,7 +66,7 @@ class RunOptions:
 def over_folder(
     start: Callable[..., "Summary"], folder: Path, out: Path, run: RunOptions, **options: Any
 ) -> int:
-    """Run a task over a folder with bars on the way, and tell what came of it; the exit code.
+    """Run a task over a folder with progress bars, and print the summary; return the exit code.
 
     Args:
         start: `spt_jax.datasets.clean` or another.
@@ -90,7 +90,7 @@ def over_folder(
     if run.json:
         print(json_format.dumps(summary.as_dict(), indent=2))
     else:
-        tell(summary, out, out_console(run.quiet))
+        print_summary(summary, out, out_console(run.quiet))
     if not run.quiet:
         _warn(summary, out)
     return 1 if {"failed", "lost"} & set(summary.by_status) else 0
@@ -128,7 +128,7 @@ def refuse_for_folder(**used: bool) -> None:
             raise ValueError(f"{name} is for a single file: got it with a folder; leave it out.")
 
 
-def tell(summary: "Summary", out: Path, console: Console) -> None:
+def print_summary(summary: "Summary", out: Path, console: Console) -> None:
     """Print what came of a data set."""
     done = ", ".join(f"{count} {status}" for status, count in summary.by_status.items())
     kept = f", {summary.kept} of them done before" if summary.kept else ""

@@ -86,7 +86,7 @@ def fit(
         regularizer: what keeps a body from passing through itself: the self-intersection penalty,
             nothing, or the paper's rivals.
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
-            is a fold and does not count; not given: as near as the place allows, 0.3 on trunk and
+            is a fold and is excluded; not given: as near as the place allows, 0.3 on trunk and
             limbs and 0.02 to 0.04 on fingers.
         robust: how far off, in pixels, a keypoint is half taken for a mistake (Geman-McClure);
             "auto" is 10 % of the larger side of the box around the person's keypoints; "off" trusts

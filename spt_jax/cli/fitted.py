@@ -1,4 +1,4 @@
-"""What `spt-jax fit` tells, writes and draws of people once they are fitted."""
+"""What `spt-jax fit` prints, writes and draws of people once they are fitted."""
 
 from collections.abc import Sequence
 from contextlib import suppress

@@ -220,7 +220,7 @@ def left_out(before: Iterable["IntersectionReport"], after: Iterable["Intersecti
     return "left out as folds: " + ", ".join(f"{what} {when}" for what, when in parts)
 
 
-def tell(
+def print_summary(
     frames: Sequence[Frame],
     report: dict[str, Any],
     folder: Path,

@@ -112,7 +112,7 @@ def rate_of(asked: Chosen, fps: float | None) -> tuple[float, str | None]:
 
 
 def chosen_up(body: "BodyModel", motion: Motion, up: str) -> tuple[tuple[float, ...], str | None]:
-    """The direction that is up, and a note where it is told by where the heads are.
+    """The direction that is up, and a note where it is inferred from the positions of the heads.
 
     Raises:
         ValueError: something that is no axis.

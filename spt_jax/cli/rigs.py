@@ -47,7 +47,7 @@ def untangle_rig_file(
         from spt_jax.cli.frames import (
             as_report,
             made_from,
-            tell,
+            print_summary,
             untangle_frames,
             write_meshes,
         )
@@ -76,7 +76,7 @@ def untangle_rig_file(
                 }
                 write_json(folder / "report.json", report)
                 run.finish()
-    tell(done, report, folder, json=json, quiet=quiet)
+    print_summary(done, report, folder, json=json, quiet=quiet)
     return 0
 
 

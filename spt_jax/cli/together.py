@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from spt_jax.cli.frames import Frame, Motion, as_report, made_from, tell, untangle_frames
+from spt_jax.cli.frames import Frame, Motion, as_report, made_from, print_summary, untangle_frames
 from spt_jax.cli.motions import Chosen, write_motions
 from spt_jax.cli.posed import posed_on
 from spt_jax.cli.terminal import (
@@ -129,7 +129,7 @@ def untangle_together(
                 write_json(folder / "report.json", report)
                 run.finish()
     table, line = _table(done, counted, scenes), _summary(done, counted)
-    tell(done, report, folder, json=json, quiet=quiet, table=table, line=line)
+    print_summary(done, report, folder, json=json, quiet=quiet, table=table, line=line)
     return 0
 
 

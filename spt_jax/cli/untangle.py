@@ -83,8 +83,8 @@ def untangle(
             itself is not looked at.
         frame_by_frame: free each frame by itself, as single poses are.
         fps: frames a second; not given: those of the file, or 30.
-        up: the axis that is up, by which standing feet are told: x, y, z, -x, -y, -z; "auto": the
-            one along which heads are above hips.
+        up: the axis that is up, by which standing feet are detected: x, y, z, -x, -y, -z; "auto":
+            the one along which heads are above hips.
         rays: how many rays to cast along the longer side of each of three beams; the search uses
             half as many; not given: none, everything is measured exactly.
         anew: throw away what is done of an unfinished run in the folder.
@@ -192,7 +192,7 @@ def untangle(
         from spt_jax.cli.frames import (
             as_report,
             made_from,
-            tell,
+            print_summary,
             untangle_frames,
             write_meshes,
         )
@@ -241,7 +241,7 @@ def untangle(
                 report["files"], report["notes"] = files, notes
                 write_json(folder / "report.json", report)
                 run.finish()
-    tell(done, report, folder, json=json, quiet=quiet)
+    print_summary(done, report, folder, json=json, quiet=quiet)
     return 0
 
 

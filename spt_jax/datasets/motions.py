@@ -298,7 +298,7 @@ def clean(
         structure: "input" writes each file again in its own structure, form and precision, "amass"
             an .npz a person in AMASS' layout.
         frame_rate: of files that say none, in frames a second.
-        fade, fold_distance, margin, feet: as in `untangle_motion`; which way is up is told from
+        fade, fold_distance, margin, feet: as in `untangle_motion`; which way is up is inferred from
             how the trunk stands in most frames.
         max_bytes: what a file and its arrays may take; 1 GiB where None.
         pictures: how many of the worst files the report shows before and after.

@@ -12,7 +12,7 @@ from spt_jax.rest.surface import RestSurface
 
 
 class RestrictedBody(BodyModel):
-    """A body some of whose joints are at rest for good; folds are told as on the whole body."""
+    """A body with joints that always stay at rest; folds are recognized as on the whole body."""
 
     whole_rest_surface: RestSurface | None = eqx.field(static=True, default=None)
 

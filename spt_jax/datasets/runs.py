@@ -124,7 +124,7 @@ def run(
                         report(event)
             left = _left_by_others(store, busy, report)
     except BaseException:
-        # What is done is told, at least where there is room for it.
+        # What is done is reported, at least where there is space for it.
         with suppress(OSError):
             write_results(store, task, found, time.perf_counter() - begin, kept, draw=False)
         raise

@@ -85,7 +85,7 @@ def fit_motion(
     Args:
         body: any `BodyModel`.
         frames: the person in each frame, of `read_keypoints`, in one layout; None where not seen.
-            `spt_jax.keypoints.find_tracks` tells who is who.
+            `spt_jax.keypoints.find_tracks` follows people from frame to frame.
         camera: the one that sees all frames.
         start: as in `fit_pose`; a pose is where the first frame starts from. With `fit_shape` the
             shape is the median of those of the five frames of which most was seen, and is then held

@@ -1,4 +1,4 @@
-"""What a fit is told, by subject: where it starts, what counts, how it searches and descends."""
+"""The options of a fit, by subject: its start, its terms, its search and its descent."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -66,7 +66,7 @@ class Start(eqx.Module):
 
 
 class Terms(eqx.Module):
-    """What counts in a fit beside the regularizer, and how much.
+    """The terms of a fit other than the regularizer, and their weights.
 
     Attributes:
         prior: "mocap", a Gaussian of the embedded motion capture; one of your own (`pose_prior`, a

@@ -26,12 +26,12 @@ class SettledBFGS(optx.AbstractBFGS):
     verbose: Callable[..., None] = lambda **_: None
 
     def terminate(self, fn, y, args, options, state, tags):
-        """As optimistix decides, or where the next step is too short to tell."""
+        """As optimistix decides, or where the next step is too short to matter."""
         done, result = super().terminate(fn, y, args, options, state, tags)
         short = self.norm(state.y_eval - y) < self.atol
         return done | (short & (state.num_accepted_steps > 0)), result
 
 
 def default_solver() -> SettledBFGS:
-    """What fits use unless told otherwise."""
+    """The default solver of fits."""
     return SettledBFGS(rtol=1e-3, atol=1e-3)

@@ -23,7 +23,7 @@ def from_deeplabcut(source: Source, content: bytes) -> list[Person]:
     """People of a table of DeepLabCut's: one row a frame, one or several individuals.
 
     The header rows are scorer, individuals where there are several, bodyparts and coords; the first
-    column, or the first three, tell the frame. Where there is no likelihood (labelled by hand) a
+    column, or the first three, identify the frame. Where there is no likelihood (labeled by hand) a
     point that is there counts in full; one whose cells are empty is missing.
 
     Raises:

@@ -60,7 +60,7 @@ def read_keypoints(
 ) -> KeypointFile:
     """The people of a file of 2D keypoints.
 
-    Formats, told apart by what they hold:
+    Formats, recognized by their content:
 
     - COCO annotations: a JSON object with `annotations`. v = 0 is missing, v = 1 (labelled but
       hidden) has confidence 0.5, v = 2 has 1. Crowds and people without a labelled point are
@@ -86,8 +86,8 @@ def read_keypoints(
     `scores` (rtmlib), `visible` (Ultralytics) or the like; one number a point under another name is
     refused. A point with confidence 0 or at (0, 0) is missing. Confidences above 1, which some
     detectors give, become 1. Points that all lie in 0..1 are shares of the image's size: they are
-    scaled where the file tells it, and refused where not. Points of the face but for nose, eyes and
-    ears are not used. `notes` says what was left out or changed.
+    scaled where the file states it, and refused where not. Points of the face but for nose, eyes
+    and ears are not used. `notes` says what was left out or changed.
 
     Args:
         path: the file, .json, .npz or .csv, or a folder of OpenPose's files.

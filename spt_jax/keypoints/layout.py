@@ -15,7 +15,7 @@ class Layout(NamedTuple):
         name: what functions call it.
         names: the keypoints, in order.
         official: the keypoints as the source calls them.
-        edges: pairs of keypoints to draw lines between; `edge_side` tells left from right.
+        edges: pairs of keypoints to draw lines between; `edge_side` gives the side of each.
         points: where each keypoint lies on a body: a joint, a landmark, a fingertip, or one of
             `spt_jax.keypoints.points.COMBINATIONS`; "" for points of the face, which lie nowhere.
         sigmas: COCO's standard deviation of an annotated point, per square root of the person's

@@ -58,7 +58,7 @@ def from_openpose(
     *,
     hands: bool | None = None,
 ) -> list[Person]:
-    """People of OpenPose's JSON, of AlphaPose's, and of ControlNet's, which tells the canvas.
+    """People of OpenPose's JSON, of AlphaPose's, and of ControlNet's, which states the canvas.
 
     Args:
         source: the file.

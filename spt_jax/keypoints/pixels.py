@@ -25,7 +25,7 @@ _LARGEST_SHARE = 2.0
 def canvas_size(
     where: str, content: Mapping[str, Any], *, of_box: bool = False
 ) -> tuple[int | None, int | None]:
-    """The width and height of the image in pixels, where the file tells them.
+    """The width and height of the image in pixels, where the file states them.
 
     Args:
         where: names the file, for errors.
@@ -46,11 +46,11 @@ def in_pixels(file: Path, people: Sequence[Person], remarks: Counter[str]) -> li
     """The people with their points in pixels.
 
     Points in 0..1, which OpenPose (`keypoint_scale`), ControlNet and MediaPipe give, are multiplied
-    by the width and height of the image, where the file tells them.
+    by the width and height of the image, where the file states them.
 
     Raises:
-        ValueError: everybody's points are such shares, and the file does not tell the image's size,
-            or they are negative, as shares from -1 to 1 are.
+        ValueError: everybody's points are such shares, and the file does not state the image's
+            size, or they are negative, as shares from -1 to 1 are.
     """
     seen = [person.points[person.confidence > 0] for person in people]
     seen = np.concatenate(seen) if seen else np.empty((0, 2))

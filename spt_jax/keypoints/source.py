@@ -82,7 +82,7 @@ class Source(NamedTuple):
             what = f"keypoints of unknown names, which are not used ({', '.join(unknown[:8])}"
             self.remarks[f"{what}{', ...' if len(unknown) > 8 else ''})"] = len(unknown)
         order = ",".join(str(places[k]) for k in rows)
-        # A comma tells a list from the name of a layout.
+        # A comma distinguishes a list from the name of a layout.
         return Order(order if len(rows) > 1 else f"{order},", rows, len(listed))
 
 

@@ -67,7 +67,7 @@ def _by_id(people: Sequence[Person], frames: list[list[int]]) -> list[list[int]]
         for one in ids:
             if ids.count(one) > 1:
                 raise ValueError(
-                    f"ids must be told apart in a frame: got {one!r} twice in "
+                    f"ids must be unique within a frame: got {one!r} twice in "
                     f"{people[rows[0]].image!r}."
                 )
         for row in rows:

@@ -153,7 +153,7 @@ def places_of(
     for k, name in enumerate(found):
         if name is not None and name in found[:k]:
             raise ValueError(
-                f"keypoints must have names that are told apart: got {names[found.index(name)]!r} "
+                f"keypoints must have different names: got {names[found.index(name)]!r} "
                 f"and {names[k]!r}, both {name}; say which with a map."
             )
     return tuple(found)

@@ -6,7 +6,7 @@ stands for is not there, though: a hand ends at the wrist, a mouth is open. So t
 
 A loop is a hole of a solid only if what closes it is small beside the surface around. With L the
 length of the loop and A the area of the connected part, its size is L^2 / (4 pi A): the largest
-flat disk with such a rim, against the part. It does not change when a surface bends without
+flat disk with that perimeter, against the part. It does not change when a surface bends without
 stretching. No flat sheet has less than 1, a hemisphere has 1/2 (2/3 with a rim of teeth), a tube
 as long as it is wide 1/4 at each end, a hand at the wrist less than 1/10. Beyond `LARGEST` the part
 is a sheet, without an inside.

@@ -1,4 +1,4 @@
-"""Small convex solids, told at once: they do not intersect themselves.
+"""Small convex solids are recognized quickly: they do not intersect themselves.
 
 On some dozens of triangles the search for intersections is hundreds of calls of NumPy, each on next
 to nothing.

@@ -1,4 +1,4 @@
-"""Second derivatives of the overlap volume that counts, in closed form.
+"""Second derivatives of the included overlap volume, in closed form.
 
 The gradient is a sum over triangles of the area normal n times the integral S_t of w_out lambda_t
 over the triangle (`triangles/closed_form.py`). With the vertices it changes by n' S_t + n S_t'. n
@@ -46,7 +46,7 @@ class Curvature:
     Symmetric, and zero on rigid motions of all of the surface but for what turns the gradient.
 
     Args:
-        overlap: what was measured; only what its contours and triangles tell is kept.
+        overlap: what was measured; only data of its contours and triangles are kept.
     """
 
     def __init__(self, overlap: ExactOverlap):

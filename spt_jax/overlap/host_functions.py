@@ -156,6 +156,6 @@ def _as_held(value, gradient, rounding: float, *, least: bool):
     if not (abs(value) <= held.max and (np.abs(gradient) <= held.max).all()):
         return np.array(np.nan), np.zeros_like(gradient)
     if least and value < held.tiny:
-        # There is no overlap, but for rounding, or none that can be told from none: no slope.
+        # There is no overlap, or one within rounding of none: no slope.
         return np.zeros(()), np.zeros_like(gradient)
     return value, gradient

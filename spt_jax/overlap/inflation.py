@@ -17,10 +17,10 @@ from spt_jax.overlap.vectors import dot
 # tip needs 3; the needles beyond would shoot far out of the mesh and into its other parts.
 FARTHEST = 3.0
 
-# How sharply the triangle that a vertex has to move farthest for is told from the others. The
-# largest of several numbers has no derivative where they are equal, as at every vertex of a flat or
-# box-shaped side; the logarithm of a mean of exponentials has. It falls short of the largest by
-# log(1 / share) / 8192 at most: 0.04 % where that triangle has a twentieth of the angle.
+# How sharply the triangle that requires the largest move of a vertex is preferred to the others.
+# The largest of several numbers has no derivative where they are equal, as at every vertex of a
+# flat or box-shaped side; the logarithm of a mean of exponentials has. It falls short of the
+# largest by log(1 / share) / 8192 at most: 0.04 % where that triangle has a twentieth of the angle.
 SHARPNESS = 8192.0
 
 # exp of less is nothing beside 1.

@@ -216,7 +216,7 @@ class Measurement:
         return self.surface.count_pairs(self.surface.listed)
 
     def labels(self, rule: Rule) -> Int[np.ndarray, "V"]:
-        """The labels of the vertices, of the overlaps that count.
+        """The labels of the vertices, of the included overlaps.
 
         By each vertex itself, or by Algorithm 1's triangle rule over all beams.
         """

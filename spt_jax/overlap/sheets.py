@@ -77,7 +77,7 @@ class SheetInSolids:
         return found
 
     def _counted(self, first, second) -> Bool[np.ndarray, "N 1"]:
-        """Solids count for the sheet; nothing counts for them."""
+        """Overlap of the sheet with solids is included, that of solids with anything is not."""
         return (self._is_sheet[first] & ~self._is_sheet[second])[:, None]
 
     @cached_property

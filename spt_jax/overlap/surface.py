@@ -1,4 +1,4 @@
-"""A surface, where it meets itself and what is inside of what: all that its triangles tell.
+"""A surface, where it intersects itself and what is inside what, from its triangles alone.
 
 From the vertices to the overlaps: the surface is closed and cut into sheets (`manifold.py`), edges
 that pass through triangles are found (`pairs.py`), with exact signs (`predicates.py`), joined to
@@ -54,7 +54,7 @@ class Layer:
 
 
 class ExactSurface:
-    """A surface, and all that its triangles tell by themselves.
+    """A surface, and all that follows from its triangles alone.
 
     Attributes:
         count: how many vertices were given.
@@ -180,10 +180,10 @@ class ExactSurface:
         return int(self._listed[self.contours.pair[on]].prod(axis=1).sum())
 
     def layers(self, exclusions: Exclusions | None) -> list[Layer]:
-        """The overlaps that count whole, and those that are judged by their contours.
+        """The overlaps that are included whole, and those that their contours decide.
 
         Args:
-            exclusions: what does not count; None: every overlap does, those of fans with what is
+            exclusions: what is excluded; None: every overlap does, those of fans with what is
                 beside them, too.
         """
         faces, part = self._faces, self.manifold.part

@@ -1,1 +1,1 @@
-"""The surface at rest: distances along it and the local thickness, which tell folds apart."""
+"""The surface at rest: distances along it and the local thickness, which identify folds."""

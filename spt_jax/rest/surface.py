@@ -1,4 +1,4 @@
-"""Distances along a surface at rest: what tells a fold from a collision."""
+"""Distances along a surface at rest, which distinguish a fold from a collision."""
 
 import functools
 from typing import Any
@@ -18,7 +18,7 @@ class RestSurface:
 
     What is near depends on where: a pair of triangles is near if its distance is less than that of
     either. Connected parts of the surface that lie in each other at rest, as eyeballs in a head,
-    are told, too: overlaps of theirs do not count.
+    are recognized, too, and their overlaps are excluded.
 
     The distance of two triangles is the length of the shortest path along edges from a corner of
     one to a corner of the other: 0 where they share a vertex, infinite between parts that share
@@ -38,7 +38,7 @@ class RestSurface:
     Args:
         rest_vertices: positions of the mesh at rest, where it does not overlap itself.
         faces: indices of each triangle's corners.
-        distance: one number, or one for each face. 0.3 m tells arms from the trunk and keeps
+        distance: one number, or one for each face. 0.3 m separates arms from the trunk and keeps
             armpits and elbows together; fingers want 4 to 5 cm (`body.rest_surface` has both), and
             `local_distances(vertices, faces)` finds some for any mesh.
 
@@ -240,7 +240,7 @@ class RestSurface:
 
 
 def local_distances(rest_vertices: Any, faces: Any, girths: float = 0.8) -> Float[np.ndarray, "F"]:
-    """For each triangle of any mesh a distance to tell folds by, from how thick the solid is there.
+    """The fold distance of each triangle of any mesh, from the local thickness of the solid.
 
     The distance is a part of the girth, 2 pi r, of the largest ball that touches the surface there
     from inside; tips and edges are as thick as what they are the tips of (a quarter of the way to

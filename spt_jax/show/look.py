@@ -16,7 +16,7 @@ Picture = UInt8[np.ndarray, "height width 3"]
 INK, PAPER, GRID = "#3b3733", "#ffffff", "#e6e2dc"
 #: Behind bodies.
 BACKGROUND = (246, 244, 240)
-#: Of curves in turn: Okabe and Ito's, told apart by all kinds of color vision.
+#: Colors of curves in turn: Okabe and Ito's, which every kind of color vision can distinguish.
 CURVES = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", INK)
 #: Pixels between panels.
 GAP = 6

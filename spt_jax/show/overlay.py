@@ -18,7 +18,7 @@ from spt_jax.show.offscreen import import_extra, offscreen_plotter
 from spt_jax.show.panel import vertex_normals
 from spt_jax.show.stick_figures import as_figures, draw_figures
 
-# Bodies in turn: light, so that keypoints stand out from them, and told apart by lightness too.
+# Colors of bodies in turn: light, so that keypoints stand out, and of different lightness.
 _BODIES = ((213, 201, 188), (168, 196, 205), (196, 181, 209), (176, 203, 171), (222, 196, 150))
 _OPACITY = 0.85  # of a body over a photograph: what lies under it still shows
 _OVERSAMPLING = 2
@@ -57,7 +57,7 @@ def render_overlay(
         confidence: (K,), (N, K) or a list; all are seen if None.
         fitted: where the bodies have them: the `keypoints` of a `FitResult`.
         skeleton: the keypoints' layout, by name or from `spt_jax.keypoints`, or one for each
-            person; None draws no lines and does not tell left from right.
+            person; None draws no lines and does not distinguish left from right.
         opacity: of the bodies; 0.85 over a photograph and 1 on a canvas if None.
         path: a .png file to write as well, atomically.
 

@@ -10,7 +10,7 @@ from spt_jax.keypoints.layout import Layout, edge_side, side
 from spt_jax.keypoints.layouts import as_layout
 from spt_jax.show.look import CURVES, INK, PAPER, blank_figure, drawn
 
-# Okabe and Ito's blue and orange are told apart by all kinds of color vision.
+# Okabe and Ito's blue and orange, which every kind of color vision can distinguish.
 _SIDES = {"left": CURVES[1], "right": CURVES[4], "middle": INK}
 _FAINTEST = 0.45  # of a point of confidence 0.01; one of 1 is opaque
 

@@ -46,7 +46,7 @@ def standing_feet(
         up: the direction that is up, of length one.
         on_ground: whether the translation of the frames says where the ground is: at the lowest
             place of the whole motion. Otherwise it is wherever each body is lowest in each frame,
-            and how fast a foot is cannot be told.
+            and the speed of a foot is unknown.
     """
     feet = feet_of(body)
     if not len(feet):

@@ -23,7 +23,7 @@ from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.spread import Spread, Surface
 
 # How far a push spreads, in edges, by the root of the number of vertices in the overlap: wide
-# enough that the middle of a deep overlap and its rim move together. Of 0.17, 0.25 and 0.5, the
+# enough that the middle of a deep overlap and its contour move together. Of 0.17, 0.25 and 0.5, the
 # small ones move the worst frames least (56, 60 and 212 mm for a body that lies on its arms) and
 # more often need a second attempt, in which it is doubled.
 _REACH = 0.2
@@ -79,7 +79,7 @@ class Place:
         found: what was measured of them, exactly.
         intersections: of edges through triangles that are to go; in the numbering of
             `found.surface`.
-        left: pairs of triangles that are to go. More than those that count as intersecting: in
+        left: pairs of triangles to be separated. More than those counted as intersecting: in
             single precision, also those that are deeper in each other than rounding alone explains.
         inverted: connected parts whose volume changed its sign.
     """

@@ -150,7 +150,7 @@ def _step(
 
 
 def _wishes(place: SheetPlace, gap: float):
-    """Where vertices would go, and how much that counts."""
+    """Where vertices would go, and the weight of each."""
     found, count = place.found, len(place.vertices)
     wish, weight = np.zeros((count, 3)), np.zeros(count)
     at, nearest = found.nearest()

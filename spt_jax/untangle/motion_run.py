@@ -55,9 +55,9 @@ class Run:
 
     Args:
         body, frames: the motion.
-        exclusions: what does not count.
+        exclusions: what is excluded.
         kept: what was done before, and where what is done goes.
-        report: is told how far it has come.
+        report: called with the progress.
     """
 
     def __init__(

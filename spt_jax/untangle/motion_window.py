@@ -107,7 +107,7 @@ def solve(
         known: what is asked of the correction but for collisions.
         anchors: what of the body is to stay.
         before: the overlap of the frames as they are given.
-        exclusions: what does not count.
+        exclusions: what is excluded.
         margin: how far apart colliding parts are pushed, in metres.
         tolerance: a volume that is none where nothing intersects, in m^3.
         on_round: called after each round.

@@ -1,7 +1,7 @@
 """A limb that has passed through another part: the sides on which it could be, by a search.
 
 The descent follows the overlap's gradient, which leads out on the side where the overlap is less
-now, be it the longer way. What lies on which side is told by looking: the limb is swung about its
+now, be it the longer way. Which side is clear is found by trying: the limb is swung about its
 root, around twelve axes and farther and farther, until nothing collides, and back as far as nothing
 does. From the nearest of these places the descent starts again, with weights that are too strong to
 let it pass through once more.

@@ -151,7 +151,7 @@ class Spread:
     def _factor(self) -> Any:
         inside = self.patch
         # All rows of L that a vertex of the patch takes part in, so that the displacement goes to
-        # zero smoothly: at the patch's rim its Laplacian counts too.
+        # zero smoothly: at the patch's boundary its Laplacian is included.
         bend = scipy.sparse.diags(self.reach**2 / 6.0) @ self.surface.laplacian[:, inside]
         form = scipy.sparse.identity(len(inside)) + bend.T @ bend
         # Symmetric and positive definite: no pivoting, which would fill the factors in.

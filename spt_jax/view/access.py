@@ -52,7 +52,7 @@ class Access:
         if origins and [origin.lower() for origin in origins] != [f"http://{hosts[0].lower()}"]:
             return f"Origin must be the view's own page: got {_shown(origins)}."
         given = _query(target).get("token", [])
-        # Compared as bytes, in a time that does not tell how much of it is right.
+        # Compared as bytes, in a time that does not reveal how much of it is right.
         if len(given) != 1 or not hmac.compare_digest(_as_bytes(given[0]), self.token.encode()):
             return "The token is missing or wrong: open the address that spt-jax view printed."
         return None
@@ -60,7 +60,7 @@ class Access:
     def redirection(self, target: str, headers: Any) -> str | None:
         """Where a request for the page that `refusal` let through goes first; None if to the page.
 
-        viser's page connects to the address that it is told in its query, so it is told the one
+        viser's page connects to the address given in its query, so it is given the one
         with the token, on the host by which the browser itself came: a forwarded port has another.
         """
         socket_address = f"ws://{headers.get_all('Host')[0].lower()}/?token={self.token}"

@@ -111,7 +111,7 @@ class Panel:
         hint = "Measure the exact volume, or as the paper does: 512 rays, the triangle rule"
         measure = gui.add_dropdown("Measure", MEASURES, initial_value=MEASURES[0], hint=hint)
         if self._scene.body is not None:
-            hint = "Skin that folds where a joint bends counts too, and is untangled too"
+            hint = "Folds of skin where a joint bends are measured and untangled, too"
             folds = gui.add_checkbox("Count folds", self._scene.count_folds, hint=hint)
             self._on(folds, "folds", "count_folds")
         through = gui.add_checkbox("See through", True, hint="Show what lies within another part")

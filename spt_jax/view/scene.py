@@ -34,7 +34,7 @@ class Reading:
     Attributes:
         vertices: the positions that were measured.
         labels: +1 penetrating, -1 inverted, 0 clear.
-        volume: the overlap volume that counts, in the cube of the vertices' unit.
+        volume: the included overlap volume, in the cube of the vertices' unit.
         intersecting_pairs: the number of face pairs that intersect and count.
         milliseconds: that measuring took.
         error: why there is nothing to measure, in one line; then the volume is NaN and no vertex is
@@ -69,7 +69,7 @@ class Scene:
         pose: axis-angle of each joint, radians; no rows for a mesh.
         shape: coefficients; none for a mesh.
         translation: in metres.
-        count_folds: whether skin that folds at a joint counts.
+        count_folds: whether folds of skin at joints are included.
         paper: measure as the paper does: the triangle rule on 512 rays along one direction.
     """
 

@@ -31,7 +31,7 @@ from spt_jax.view.worker import Worker
 # A fist in the belly: something to untangle at first sight.
 _FIRST = ("punch", "punch/0013")
 _ERROR_SECONDS = 15.0
-# What ends a search under way: the newest wish counts.
+# What ends a search under way: the newest request has priority.
 _EDITS = frozenset(
     {"choose_motion", "choose_frame", "turn_axis", "turn_in_world", "set_shape"}
     | {"reset", "open_upload", "open_embedded"}

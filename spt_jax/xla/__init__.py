@@ -18,10 +18,11 @@ What differs:
 - Everything is measured by rays; the closed form stays on the host. `rays=None` means 512 along
   the longer side, and overlaps between the rays are not seen. `rule="triangle"` is by rays too.
 - Overlaps are connected where their surfaces are, so that on meshes of few large triangles they run
-  into each other. What does not count takes two passes over the rays; `rest_surface` also a table
+  into each other. Exclusions take two passes over the rays; `rest_surface` also takes a table
   of 50 MB for the embedded body, once.
-- An interval counts or is left out as a whole. Where three solids overlap and one of their pairs is
-  left out, which of the other pairs go with it depends on the order in which rays meet them.
+- An interval is included or excluded as a whole. Where three solids overlap and one of their pairs
+  is excluded, which of the other pairs is excluded with it depends on the order in which rays meet
+  them.
 - More than 16,000 parts (at 512 rays) over one another, or a row of the screen with more crossings
   than the buffers hold, give NaN, and `usage.device_usage` reports it.
 
@@ -29,7 +30,7 @@ What it costs. All arrays have fixed sizes (`settings.Xla`); the screen is worke
 rows that fit, one direction and, on a CPU, one mesh after the other; `settings.bytes_needed` is an
 upper bound of the memory. The benchmark prints the memory, the operations and the bytes of one
 strip by XLA's own count, and the time on the device that it runs on; at 512 x 512 three directions
-take three or four strips. Nothing was measured on a GPU. A CPU should use the host's way.
+take three or four strips. It has not been measured on a GPU. On a CPU, use the exact backend.
 
 Floating-point numbers are chosen so that float32 will do: places on the screen are whole pixels and
 parts of one (`beam`), those in a triangle are relative to its edges (`crossings`), and lengths to

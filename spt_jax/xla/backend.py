@@ -147,7 +147,7 @@ def _labels(clean, faces, task: Task, codes: Int[Array, "V"]):
     label = vertex_labels(clean, faces, jnp.asarray(task.tables.frames))
     if task.tables.exclusions is None:
         return label
-    # A connected patch counts whole or not at all.
+    # A connected patch is included whole or not at all.
     return jnp.where(spread(codes > 0, label != 0, faces), label, 0)
 
 

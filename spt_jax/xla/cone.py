@@ -14,7 +14,7 @@ def within_cone(
 ) -> tuple[Bool[Array, "V"], Bool[Array, "V"]]:
     """Whether a step from each vertex leads to the inner side of its triangles.
 
-    And whether they have an inner side: not on the rim of a hole.
+    And whether they have an inner side: not on the boundary of a hole.
     """
     num = len(vertices)
     of = faces.T.reshape(-1)

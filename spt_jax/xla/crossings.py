@@ -6,7 +6,7 @@ of a closed mesh sum to zero whatever the rounding. Places on the screen are rel
 of their edge, which keeps float32 exact to a millionth of a pixel for triangles of some pixels.
 
 A screen is worked off in strips of rows, each as high as the arrays allow. First the triangles of a
-strip are cut into segments of one row, then the segments into crossings. Three numbers per ray tell
+strip are cut into segments of one row, then the segments into crossings. Three numbers per ray show
 which rays may meet an overlap, most often one in ten; only their crossings are sorted.
 """
 
@@ -242,10 +242,10 @@ def _worth_sorting(
     """How many crossings of each ray to sort, and which rays are open.
 
     As `overlap.rays.crossings._worth_sorting`: of the others, entries and exits and the depths of
-    the first and the last of each tell that they meet no overlap.
+    the first and the last of each show that they meet no overlap.
     """
     entry_or_exit = jnp.where(used, 2 * ray + code % 2, 2 * num_rays)
-    # A triangle seen edge-on is met by rounding alone: nothing on its rays can be told.
+    # A triangle seen edge-on is met by rounding alone: nothing on its rays can be determined.
     farthest = jnp.where(code // 2 % 2 == 1, _BEYOND, depth)
     zeros = jnp.zeros(2 * num_rays, jnp.int32)
     count = zeros.at[entry_or_exit].add(1, mode="drop", wrap_negative_indices=False).reshape(-1, 2)

@@ -46,7 +46,7 @@ class Intervals(NamedTuple):
 
 
 def most_levels(size: int) -> int:
-    """The deepest level that can be told where so many crossings are sorted."""
+    """The deepest level that can be determined where so many crossings are sorted."""
     return 2**30 // size - 2
 
 
@@ -149,7 +149,7 @@ def _around(key, opens, closes, levels, face, most) -> Int[Array, "N 2"]:
 
 
 def kept_only(intervals: Intervals, counted: Bool[Array, "N"]) -> Intervals:
-    """The intervals with those that do not count taken out."""
+    """The intervals without the excluded ones."""
     return intervals._replace(
         outer=jnp.where(counted, intervals.outer, 0),
         length=jnp.where(counted, intervals.length, jnp.zeros_like(intervals.length)),

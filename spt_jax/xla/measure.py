@@ -55,7 +55,7 @@ def cast_beams(
     wants: Wants,
     exclusions: ExclusionTables | None = None,
 ) -> tuple[Found, Usage, Bool[Array, ""]]:
-    """Every beam of the sampling through one mesh; twice where something does not count.
+    """Every beam of the sampling through one mesh; twice where something is excluded.
 
     Args:
         vertices, faces: finite, and in range.

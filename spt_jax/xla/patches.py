@@ -11,7 +11,7 @@ def spread(
     """The members that a path over triangles connects with a seed, through members alone.
 
     A seed that is no member passes on to the members of its triangles: it is a corner of a triangle
-    that the rim of an overlap cuts.
+    that an intersection contour cuts.
     """
 
     def over_triangles(vertices):

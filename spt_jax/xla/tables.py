@@ -95,7 +95,7 @@ class RestTable(NamedTuple):
 
 
 class ExclusionTables(NamedTuple):
-    """What tells which overlaps do not count."""
+    """The tables that decide which overlaps are excluded."""
 
     groups: GroupTable | None
     rest: RestTable | None
@@ -107,7 +107,7 @@ class Tables(NamedTuple):
     Attributes:
         aims: the directions of the rays.
         frames: of the rays through vertices, as `winding.generic_frames`.
-        exclusions: None where everything counts.
+        exclusions: None where nothing is excluded.
     """
 
     aims: Aims

@@ -6,7 +6,7 @@ of p's own triangles. On a closed mesh F + O + B = 0; the winding number is F ju
 F + O just after. Where O is +1 or -1 the ray goes through the surface at p, whose outer side has
 w_out = min(F, F + O). Where O is 0 the ray only touches the surface there, as on a silhouette:
 either both of its sides are outside the cone of p's triangles, and w_out = F, or both are within,
-and w_out = F - 1. The part of the cone that is nearest to the ray tells which (`cone.py`).
+and w_out = F - 1. The part of the cone that is nearest to the ray decides which (`cone.py`).
 
 The host follows the winding number along the surface instead (`overlap.triangles.winding`); the two
 may differ at a vertex whose own triangles pass through one another, which has several.

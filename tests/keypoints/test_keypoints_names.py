@@ -62,7 +62,7 @@ def test_a_layout_is_a_list_of_names_too():
     assert layout.points == ("left_wrist", "between_shoulders", "left_knee", "right_wide_hip")
     for wrong, message in (
         ("left_wrist,tail", "that are known: got 'tail'"),
-        ("lwri,left_wrist", "told apart: got 'lwri' and 'left_wrist', both left_wrist"),
+        ("lwri,left_wrist", "different names: got 'lwri' and 'left_wrist', both left_wrist"),
         ("tails", "or a list of keypoints with commas between them: got 'tails'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -129,7 +129,7 @@ def test_a_map_says_what_other_names_mean(tmp_path):
     for wrong, message in (
         ({"left_paw": "lpaw"}, "map must give names of keypoints .* got 'left_paw'"),
         ({"left_wrist": "rpaw"}, "map must name keypoints of the file: got 'rpaw'; it has tail"),
-        ({"nose": "lpaw"}, "told apart: got 'lpaw' and 'Nose', both nose"),
+        ({"nose": "lpaw"}, "different names: got 'lpaw' and 'Nose', both nose"),
     ):
         with pytest.raises(ValueError, match=rf"points\.csv: .*{message}"):
             read(tmp_path, table(), "points.csv", map=wrong)

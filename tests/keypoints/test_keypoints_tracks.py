@@ -63,7 +63,7 @@ def person(x, image, *, id=None, seen=25, size=100.0, layout="body25"):
 def test_people_are_followed_by_ids_where_all_have_one():
     people = [person(0, 0, id=7), person(400, 0, id=8), person(0, 1, id=8), person(400, 1, id=7)]
     assert find_tracks(people) == [[0, 3], [1, 2]]
-    with pytest.raises(ValueError, match="told apart in a frame: got 7 twice in 0"):
+    with pytest.raises(ValueError, match="unique within a frame: got 7 twice in 0"):
         find_tracks([person(0, 0, id=7), person(400, 0, id=7)])
 
 

@@ -125,7 +125,7 @@ def test_folds_and_groups_of_bodies(frame, rng):
 def test_where_nothing_overlaps_there_is_no_curvature():
     vertices, faces = join(box(), box(center=(3.0, 0.0, 0.0)))
     assert not measured(vertices, faces).curvature.times(np.ones_like(vertices)).any()
-    # Nor where sides lie in one plane, of what cannot be told from contact.
+    # Nor where sides lie in one plane, of what cannot be distinguished from contact.
     vertices, faces = join(box(), box(center=(0.6, 0.0, 0.0)))
     product = measured(vertices, faces).curvature.times(vertices)
     assert np.isfinite(product).all() and np.abs(product).max() < 10

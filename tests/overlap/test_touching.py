@@ -135,7 +135,7 @@ def _exact(columns):
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_with_twice_the_digits_float32_is_exact(size, rng):
-    """Also where the determinant is exactly zero, which no bound on rounding can tell."""
+    """Also where the determinant is exactly zero, which no bound on rounding can decide."""
     points = rng.uniform(-1, 1, (size + 1, size, 200)).astype(np.float32).astype(np.float64)
     points[-1, :, ::2] = points[1, :, ::2] + points[2, :, ::2] - points[0, :, ::2]
     points[-1] = points[-1].astype(np.float32)
@@ -155,7 +155,7 @@ def test_with_twice_the_digits_float32_is_exact(size, rng):
 
 
 def test_what_has_too_many_digits_is_not_said_to_be_known():
-    """A determinant below what twice the digits can tell."""
+    """A determinant below what twice the digits can resolve."""
     least = 2.0**-120
     points = [np.array([[x], [y], [z]]) for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0))]
     points.append(np.array([[1.0], [1.0], [least]]))

@@ -1,4 +1,4 @@
-"""What engines tell, as files are worked on.
+"""The events that engines report while files are processed.
 
 An engine takes a store, a task and files, and gives `Finished` and `Progress` as they come. It has
 no state worth keeping: what is done stands in the store.

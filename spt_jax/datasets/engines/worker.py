@@ -1,4 +1,4 @@
-"""A process that works on files of a data set, one after the other, as it is told.
+"""A process that works on files of a data set, one after the other, as it is instructed.
 
 It is started by command line, not forked, because a fork of a process with threads may hang, and
 not through `multiprocessing`, which runs the user's main script once more. It ends at once when its

@@ -59,7 +59,7 @@ class Store:
 
         Args:
             settings: what results depend on, as JSON types.
-            anew: forget what was done, with whatever settings.
+            anew: discard all results, whatever settings they were made with.
 
         Raises:
             ValueError: what is there was made with other settings.

@@ -19,7 +19,7 @@ from spt_jax.body.skinning import (
 from spt_jax.fit.problem.variables import Variables
 from spt_jax.keypoints import KeypointRegressor
 
-# A joint that moves a landmark with less than a hundredth of its weight is not told by it.
+# A joint that moves a landmark with less than a hundredth of its weight is not determined by it.
 _LEAST_WEIGHT = 0.01
 
 

@@ -91,7 +91,7 @@ def as_people(
         start: pose; shape and translation as the user gave them, or None.
         expected_error: in pixels, one or one a person, or None for a share of the person's size.
         robust: Geman-McClure's scale in pixels, one or one a person, or None.
-        placed: whether each keypoint lies anywhere on the body; those that do not count as unseen.
+        placed: whether each keypoint lies anywhere on the body; the others are treated as unseen.
 
     Raises:
         TypeError, ValueError: as `fit_pose`.

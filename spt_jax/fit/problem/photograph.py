@@ -14,7 +14,7 @@ NEAREST, FARTHEST = 0.1, 200.0
 # In metres, of a posed body's longest side along an axis: a newborn curled up, a tall man stretched
 # out and some room for what a shape fit may do.
 SMALLEST, LARGEST = 0.2, 4.0
-# In pixels: no detector tells the keypoints of a person apart in fewer.
+# In pixels: no detector resolves the keypoints of a smaller person.
 LEAST_PIXELS = 8.0
 # In degrees: the corners of the widest lenses that keep lines straight are 67 degrees off the axis.
 WIDEST = 70.0
@@ -36,7 +36,7 @@ def outside_photographs(
     """Why no photograph could show a fit: DISTANCE, SIZE or FOCAL; 0 if one could.
 
     Args:
-        objective: of the person; its seen keypoints tell the distance.
+        objective: of the person; its seen keypoints determine the distance.
         vector: where the fit ended.
         vertices: of the body, in metres.
 

@@ -110,7 +110,7 @@ class GaussianPosePrior(PosePrior):
     density, less a constant. `pose_prior` makes one for a body from poses.
 
     Attributes:
-        mean: axis-angle of every joint, in radians; the root's is zero and does not count.
+        mean: axis-angle of every joint, in radians; the root's is zero and ignored.
         whitening: W with W^T W the inverse covariance of all joints but the root.
 
     Example:

@@ -14,7 +14,7 @@ from spt_jax.fit.problem.variables import Variables
 _NUM_VIEWS = 64
 
 # Keypoints of the trunk keep their distances; how far the others move away from where the mean
-# pose has them is not known, and a seventh of the weight is enough to tell up from down.
+# pose has them is not known, and a seventh of the weight is enough to distinguish up from down.
 _TRUNK = ("pelvis", "hip", "spine1", "spine2", "spine3", "neck", "collar", "shoulder")
 _LIMB_WEIGHT = 0.15
 

@@ -122,7 +122,7 @@ class BodySpheres(eqx.Module):
         if not len(found.part):
             raise ValueError(
                 "body must enclose a volume: got no point inside; check_mesh(body.template, "
-                "body.faces) tells what is wrong with the surface."
+                "body.faces) says what is wrong with the surface."
             )
         dtype = body.template.dtype
         return cls(
@@ -269,7 +269,7 @@ def sphere_depths(
         spheres, body, pose, shape: as in `sphere_penalty`.
 
     Returns:
-        Depths above the diagonal; zero where a pair does not collide or does not count.
+        Depths above the diagonal; zero where a pair does not collide or is excluded.
 
     Raises:
         TypeError, ValueError: as the body does.
@@ -311,7 +311,7 @@ def _depths(spheres: BodySpheres, tree: _Tree, angles, betas):
     centers, radii = _posed(spheres, tree, angles, betas)
     rank = centers.ndim - 2
     _, rest, _ = _at_rest(spheres, tree, betas, angles.dtype)
-    # All pairs, not a gather of those that count: the gradient of a gather is a scatter.
+    # All pairs, not a gather of the included ones: the gradient of a gather is a scatter.
     reach = radii[..., :, None] + radii[..., None, :]
     reach = jnp.minimum(reach, lift((1 - _SLACK) * _distances(rest), rank, 2))
     counts = spheres.counts.reshape((1,) * rank + spheres.counts.shape)

@@ -32,7 +32,7 @@ class Surface(NamedTuple):
         """Whether points lie inside, and the sample nearest to each.
 
         By the side of the nearest sample's triangle: on the embedded body 0.05 % of points are
-        told wrong, by libigl's winding number; and holes elsewhere do not matter.
+        classified wrongly, by libigl's winding number; and holes elsewhere do not matter.
         """
         nearest = self.tree.query(points)[1]
         apart = points - self.points[nearest]

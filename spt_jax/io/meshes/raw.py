@@ -20,7 +20,7 @@ class RawMesh:
     Attributes:
         vertices: positions, in the file's order, faces refer to them.
         faces: triangles; polygons of more corners are cut already.
-        double: whether the file tells positions apart beyond single precision.
+        double: whether the file holds positions in more than single precision.
         extras: what the file says beside the shape, such as "texture coordinates".
         notes: what a reader of the file should know of how it was read, one sentence each.
         rewrite: the file's content with other positions for the vertices and all else as it was;
@@ -74,7 +74,7 @@ def crossing_notes(crossed: int, short: int = 0) -> tuple[str, ...]:
 
 
 def holds_double(values: np.ndarray) -> bool:
-    """Whether numbers read from a text have more digits than single precision tells apart.
+    """Whether numbers read from a text have more digits than single precision can hold.
 
     Nine significant digits say a float32 exactly; one more says a float64.
     """

@@ -94,7 +94,7 @@ def read_mesh(
     again: vertices on edges without a partner are joined where they are at exactly the same
     position, then where they are within four units in the last place of the largest coordinate.
     Triangles that collapse thereby are dropped. So a closed surface reads as closed, while closed
-    parts that merely touch stay apart (not in .stl, which has nothing to tell them by). Nothing
+    parts that merely touch stay apart (not in .stl, which has nothing to separate them by). Nothing
     else is merged, repaired or reordered. `open_mesh` says what was done.
 
     Args:

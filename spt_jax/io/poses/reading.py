@@ -40,7 +40,7 @@ from spt_jax.io.poses.track import MotionFile, Track
 from spt_jax.io.poses.whole import POSES, is_motion_x, read_bare, read_motion_x, read_whole
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".p", ".joblib", ".pt", ".pth", ".json", ".bvh")
-"""What pose files are called; what is in them tells which structure they have."""
+"""The suffixes of pose files; their structure is recognized by their content."""
 
 
 # Motions that are not read, but are no meshes either: their message is about poses.
@@ -125,7 +125,7 @@ def load_poses(
 ) -> list[Track]:
     """The tracks of a pose file, one a person.
 
-    Structures are told apart by what is in the file: AMASS and MOYO, SMPLify-X, PROX, HMR2 and
+    Structures are distinguished by what is in the file: AMASS and MOYO, SMPLify-X, PROX, HMR2 and
     VPoser's parts, PHALP (4D-Humans), VIBE, PyMAF, WHAM, GVHMR, TRAM, ROMP, BEV, SLAHMR, BEDLAM,
     AIST++, 3DPW, EasyMocap, MMHuman3D, Motion-X and BVH, in .npz, .npy, .pkl (joblib's too), .pt,
     .json and .bvh. Rotations may be axis-angle vectors, matrices, six numbers or quaternions.

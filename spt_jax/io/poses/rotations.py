@@ -171,7 +171,7 @@ def form_of(
         values: (N, joints, ...), (N, joints * size) or one frame of these.
         joints: how many.
         frames: how many frames there are, where that is known: (3, 3) may be three of vectors.
-        forms: those that may be, where others tell.
+        forms: those that are possible, where other entries decide.
 
     Raises:
         ValueError: six numbers that are orthonormal in neither order.

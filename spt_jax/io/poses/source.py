@@ -139,7 +139,7 @@ class Source:
             way, index: of the array.
             joints: which rows of a track's pose they are.
             frames: how many frames there are, where that is known.
-            forms: those that may be; where none are given, the shape tells.
+            forms: those that are possible; where none are given, the shape decides.
             rows: which frames of the track they are.
 
         Raises:

@@ -85,7 +85,7 @@ def place_joints(
 
 
 def _names(names: list[str]) -> tuple[str, ...]:
-    """Each once: nodes of one name are told apart by a number."""
+    """Unique names: nodes of the same name get a number."""
     seen: dict[str, int] = {}
     found = []
     for name in names:

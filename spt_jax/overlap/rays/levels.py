@@ -22,7 +22,7 @@ from spt_jax.overlap.rays.beam import Beam, ScreenPoints
 from spt_jax.overlap.rays.crossings import Crossings
 
 # A triangle seen edge-on is a line on the screen. Narrower than this, in pixels, rounding decides
-# which rays hit it and at which of its depths, and nothing on such a ray can be told.
+# which rays hit it and at which of its depths, and nothing on such a ray can be determined.
 NARROWEST = 1e-5
 
 # Overlaps thinner than this part of the mesh's depth are no overlaps: where a ray grazes a

@@ -89,7 +89,7 @@ def shares_of(
     Args:
         vertices: positions.
         topology: of the mesh.
-        intersections, contours: those that count on the layer.
+        intersections, contours: those that are included on the layer.
         ends: the winding numbers.
         layer: which of them.
         times: how often each triangle is there, all copies in one place; once if not given. Of

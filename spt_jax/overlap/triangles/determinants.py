@@ -69,7 +69,7 @@ def vanishes(*factors):
 
 
 def doubled_determinants(rows, unit):
-    """Determinants of the differences to the first row, with twice the digits; where they tell.
+    """Determinants of the differences to the first row, in doubled digits, and which are certain.
 
     Args:
         rows: the points, (3, N) or (2, N) each.

@@ -4,11 +4,11 @@ By boxes first (`pair_boxes.py`), then by the planes of either (`pair_planes.py`
 at last by signs that are exact.
 
 Solids that touch have thousands of pairs whose boxes share no more than a side: all of a lattice's
-that stand on each other. To tell each of them apart by signs that vanish costs more than all else.
+that stand on each other. To decide each of them by signs that vanish costs more than all else.
 But the push that decides such signs (`predicates.py`) orders the vertices along each axis, too,
 those in one place by their pushes; and boxes of ranks in that order are those of the pushed
 surface, which has no contact. So where most boxes only touch, they are compared by rank: solids
-that stand on each other are told apart as groups, as if they were apart by a meter.
+that touch are separated as groups, as if they were a meter apart.
 """
 
 from functools import cached_property
@@ -134,7 +134,7 @@ class NearTriangles:
         """The corners of triangles that lie on others."""
         near, (layout, shape) = self._near, self._boxes[:2]
         if near is None:
-            # They were told apart by rank, or were known to be.
+            # They were separated by rank, or were known to be.
             near = (self._not_apart(t, u)[2] for t, u in self._by_place())
         return contacts_of(layout, shape, near, self._reach)
 

@@ -59,7 +59,7 @@ _SHORT_GUARDS = np.uint32(sum(1 << (_SHORT_FIELD * k + _SHORT_FIELD - 1) for k i
 _SHORT_SIGNS = np.uint32(sum(1 << (_SHORT_FIELD * k + _SHORT_FIELD - 2) for k in range(3)))
 # Clusters so many times as large as the usual one are compared in long words.
 _LARGE = 5
-# So many pairs of boxes tell whether most only touch.
+# So many pairs of boxes are sampled to decide whether most only touch.
 _SAMPLE = 256
 Pairs = list[tuple[np.ndarray, np.ndarray]]
 

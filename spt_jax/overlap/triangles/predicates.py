@@ -42,7 +42,7 @@ _POOR = 2.0**16
 # So many undecided signs are worth a search for those that are asked for again.
 _MANY = 2000
 
-# Of the pushes: a step along the normal, and what is added to tell equal ones apart.
+# Of the pushes: a step along the normal, and what is added to break ties.
 _STEP, _NOISE = 2.0**40, 2.0**28
 
 
@@ -213,7 +213,7 @@ class Predicates:
         return sign, value
 
     def _exactly(self, corners, axes):
-        """Signs and values where the plain determinant does not tell."""
+        """Signs and values where the plain determinant is not certain."""
         points = self.points[list(axes)]
         rows = [points.take(x, axis=1) for x in corners]
         edges = [x - rows[0] for x in rows[1:]]

@@ -54,10 +54,11 @@ _FAR = 16
 _FEW = 0.4
 # Larger meshes are searched every time, and so are those of which so many pairs a triangle would be
 # kept. Where more than this part of the pairs meet, above a number that does not matter, solids may
-# touch: by rank they are told apart (`near_triangles.py`), by what is kept they would be looked at.
+# touch: by rank they are known to be apart (`near_triangles.py`), by what is kept they would be
+# looked at.
 _MOST_GROUPS, _MOST_PAIRS_EACH = 2048, 8
 _MANY, _MOST_MEETING = 1024, 0.1
-# Of every so many vertices some tell that a mesh is another one.
+# One of every so many vertices is compared first, to see that a mesh is another one.
 _SOME = 64
 # So many shapes of a mesh are kept, for those that are asked for in turn: a batch's, frames' of a
 # motion. To keep what is apart takes as long as another call, and each call after it takes half as
@@ -185,7 +186,7 @@ def nearest(mesh: Prepared, points: Float[np.ndarray, "3 V"], scale: float) -> K
     known = [one for one in mesh.kept if one.layout is mesh.layout and one.scale == scale]
     if not known:
         return None
-    # A few vertices tell nearly all that are not.
+    # A few vertices rule out nearly all that are not.
     moved = points[:, ::_SOME] - np.stack([one.some for one in known])
     for k, most in enumerate(np.ptp(moved, axis=2).max(axis=1).tolist()):
         limit = _FAR * known[k].growth

@@ -8,7 +8,7 @@ itself. An edge that enters another solid gains one, an edge that leaves it lose
             | A         |  0        Down the right side of A, w is 0 as far as the x, where the
             |      +----x------+    edge enters B, and 1 below it. Then left along the lower side,
             |      | 1  | 1    |    w is 1 as far as the other x, where the edge leaves B, and 0
-            +------x----+      |    beyond it. B is told by the same two places.
+            +------x----+      |    beyond it. B is decided by the same two places.
                    |         B |
                    +-----------+
 
@@ -17,8 +17,8 @@ So all is known once w is known at one vertex of each connected part:
 1. Edges through which nothing passes join vertices to patches of one w (`Blocks.patches`).
 2. Every other edge links the patches of its ends; its step is the sum of its jumps.
 3. Each part has a root, its vertex farthest along x. No triangle of the part lies beyond, so w is
-   0 there, or -1 where the part is inside out, as the edges there tell; and every other solid
-   in which it lies adds one, as a ray along x tells, which meets only other parts.
+   0 there, or -1 where the part is inside out, as the edges there show; and every other solid
+   in which it lies adds one, as a ray along x shows, which meets only other parts.
 4. From the roots w spreads along the links. A link that joins two known patches is a check: the
    steps around every loop must cancel (`Ends.fits`).
 
@@ -35,8 +35,8 @@ around it, cut by a small sphere, make a closed curve that crosses itself:
      /     \ \__/
      \______\         (`_around_cusps`)
 
-What counts may be chosen by pairs of parts: an edge of a part that enters another one makes no
-step where the two do not count, and the ray does not see such a part. Several choices, called
+Pairs of parts may be excluded: an edge of a part that enters another one makes no
+step where the pair is excluded, and the ray does not see such a part. Several choices, called
 layers, are worked out together. `tests/helpers_reference.py` has all of this in forty slow lines.
 """
 
@@ -278,7 +278,7 @@ def _outermost_edges(topology: Topology, predicates: Predicates, vertex):
     face, turn = np.divmod(topology.fan[corner], 3)
     half = 3 * face + (turn + 2) % 3  # from the vertex to the next corner
     there = topology.faces[face, (turn + 1) % 3]
-    # By the angle from y, to rounding; then the signs tell whether any other turns less.
+    # By the angle from y, to rounding; then the signs decide whether any other turns less.
     seen = predicates.points[:2]
     x, y = seen.take(there, axis=1) - seen.take(vertex[of], axis=1)
     best = np.lexsort((np.arctan2(-x, y), of))[np.cumsum(count) - count]
