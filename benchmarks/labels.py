@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float, Int
 
 from benchmarks.common import Table, progress, provenance, record_section
 from spt_jax import load_body, load_mocap
+from spt_jax.overlap.arrays.vectors import area_normals
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.rays.beam import aim
 from spt_jax.overlap.rays.crossings import cast
 from spt_jax.overlap.rays.levels import find_overlaps
 from spt_jax.overlap.surface import ExactSurface
-from spt_jax.overlap.vectors import area_normals
 
 STEP = 1e-6
 RAYS = 512

@@ -12,10 +12,10 @@ from spt_jax._penalty import Known, differentiable
 from spt_jax._query import as_choice, as_faces, as_vertices
 from spt_jax._result import Result
 from spt_jax.bridge.reverse_only import refuse_forward
+from spt_jax.overlap.arrays.vectors import area_normals
 from spt_jax.overlap.host_functions import SheetOptions, SheetValue
 from spt_jax.overlap.labels import CLEAR, PENETRATING
 from spt_jax.overlap.sheets import SheetInSolids
-from spt_jax.overlap.vectors import area_normals
 
 
 def sheet_penalty(

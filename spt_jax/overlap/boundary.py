@@ -11,9 +11,9 @@ for the surface area a / |n . d| of its triangle.
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, summed
 from spt_jax.overlap.rays.beam import Beam
 from spt_jax.overlap.rays.levels import Overlaps
-from spt_jax.overlap.vectors import area_normals, summed
 
 
 def boundary_gradient(

@@ -23,8 +23,8 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, dot
 from spt_jax.overlap.triangles.manifold import Manifold
-from spt_jax.overlap.vectors import area_normals, dot
 
 LARGEST = 0.75
 """The size, L^2 / (4 pi A), up to which a loop is closed."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import cross, dot
 from spt_jax.overlap.triangles.faces_cache import FacesCache
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.triangles.pair_planes import ROUNDING
-from spt_jax.overlap.vectors import cross, dot
 
 # Beyond, the search is hardly slower than all vertices against all planes.
 _MOST_FACES = 256

@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import cross, dot, summed
 from spt_jax.overlap.exact import ExactOverlap, Judged
 from spt_jax.overlap.surface import Layer
 from spt_jax.overlap.triangles.moving_contours import MovingContours, Rates
-from spt_jax.overlap.vectors import cross, dot, summed
 
 
 class _Moving(NamedTuple):

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import summed
 from spt_jax.overlap.caps import beside_caps
 from spt_jax.overlap.exclusions import NOTHING, Exclusions, pair_weights
 from spt_jax.overlap.surface import ExactSurface, Layer, regions_of
 from spt_jax.overlap.triangles.closed_form import gradient_of, volumes_of
 from spt_jax.overlap.triangles.contours import length_gradient
-from spt_jax.overlap.vectors import summed
 
 
 class Judged(NamedTuple):

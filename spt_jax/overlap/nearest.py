@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from spt_jax.overlap.vectors import cross, dot
+from spt_jax.overlap.arrays.vectors import cross, dot
 
 # Triangles of the first patch that are compared with the second at once.
 _CHUNK = 256

@@ -19,6 +19,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, cross, dot, summed
 from spt_jax.overlap.caps import open_sheets
 from spt_jax.overlap.depth import nearest_points
 from spt_jax.overlap.measure import Unmeasurable, check_usable
@@ -28,7 +29,6 @@ from spt_jax.overlap.triangles.contours import force_on_intersections, senses
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.overlap.triangles.near_triangles import Entangled
 from spt_jax.overlap.triangles.winding import winding_numbers
-from spt_jax.overlap.vectors import area_normals, cross, dot, summed
 
 # What the pieces of a triangle may leave open, against its longest side.
 _GAP = 1e-6

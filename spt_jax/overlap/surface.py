@@ -12,8 +12,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from spt_jax.overlap.arrays.ranges import unique
+from spt_jax.overlap.arrays.vectors import dot, summed
 from spt_jax.overlap.exclusions import Exclusions, part_rules
-from spt_jax.overlap.ranges import unique
 from spt_jax.overlap.triangles.closed_form import Shares, of_copies, shares_of, volumes_of
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours, find_contours
@@ -23,7 +24,6 @@ from spt_jax.overlap.triangles.pairs import EdgeIntersections, find_intersection
 from spt_jax.overlap.triangles.predicates import Predicates
 from spt_jax.overlap.triangles.regions import connected_regions
 from spt_jax.overlap.triangles.winding import Ends, enclosing_parts, labels_of, winding_numbers
-from spt_jax.overlap.vectors import dot, summed
 
 # Vertices that are moved by this many units in the last place of the largest coordinate, as turning
 # a mesh moves them, neither enter a triangle that they touch nor leave it.

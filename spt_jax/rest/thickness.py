@@ -4,7 +4,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from spt_jax.overlap.vectors import area_normals, dot, summed
+from spt_jax.overlap.arrays.vectors import area_normals, dot, summed
 
 # Over the surface, what is thick makes thick what lies around it: so many lengths away, the radius
 # is one length less. Tips and sharp edges, where only small balls fit, are as thick as what is

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from spt_jax.overlap.ranges import spread
+from spt_jax.overlap.arrays.ranges import spread
 
 # Pixels of triangles' boxes that are looked at together.
 _AT_ONCE = 1 << 21

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals
 from spt_jax.overlap.triangles.pairs import EdgeIntersections
-from spt_jax.overlap.vectors import area_normals
 
 # Sine below which an edge runs along the face that it crosses: the contour would run away.
 _FLATTEST = 0.05

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax._steps import OnStep, Step
+from spt_jax.overlap.arrays.vectors import area_normals, dot
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
 from spt_jax.overlap.triangles.pairs import EdgeIntersections
-from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.spread import Spread, Surface
 

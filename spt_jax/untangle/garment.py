@@ -17,8 +17,8 @@ import scipy
 from jaxtyping import Bool, Float, Int
 
 from spt_jax._steps import OnStep, Step
+from spt_jax.overlap.arrays.vectors import area_normals, summed
 from spt_jax.overlap.sheets import SheetInSolids
-from spt_jax.overlap.vectors import area_normals, summed
 from spt_jax.untangle.spread import Surface
 
 # What is left between sheet and solids, in mean edges of the sheet, and by how much it grows from

@@ -11,10 +11,10 @@ from spt_jax._query import as_directions, as_rays
 from spt_jax._result import Overlap, Result
 from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax._steps import OnStep, no_step
+from spt_jax.overlap.arrays.vectors import area_normals, dot
 from spt_jax.overlap.measure import Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.overlap.triangles.manifold import manifold_of
-from spt_jax.overlap.vectors import area_normals, dot
 from spt_jax.untangle.freeing import Freed, Place, free_vertices
 from spt_jax.untangle.garment import SheetPlace, free_sheet
 from spt_jax.untangle.spread import Surface

@@ -13,8 +13,8 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int, Shaped
 
+from spt_jax.overlap.arrays.vectors import cross, dot, summed
 from spt_jax.overlap.topology import connected
-from spt_jax.overlap.vectors import cross, dot, summed
 
 
 class Surface:

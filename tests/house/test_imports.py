@@ -1,4 +1,4 @@
-"""Which module may import which: downwards only, and the measure of one mesh without JAX."""
+"""Which module may import which: downwards only, and the measurement of one mesh without JAX."""
 
 import ast
 import graphlib
@@ -17,7 +17,7 @@ FILES = {
     if "data" not in path.relative_to(PACKAGE).parts
 }
 
-# Whoever is below must not import whoever stands above it.
+# Each folder may import those above it in this list, never those below.
 FLOORS = (
     "files",
     "overlap",
@@ -34,7 +34,7 @@ FLOORS = (
     "view",
     "cli",
 )
-# What each floor has no business with, though it stands below.
+# Folders that a folder must not import although they precede it.
 APART = {"untangle": {"fit"}, "fit": {"untangle"}, "show": {"untangle"}}
 
 
@@ -78,11 +78,10 @@ def test_no_modules_import_each_other_in_a_circle():
 
 def folder(name):
     path = FILES[name]
-    return path.parent if path.name != "__init__.py" else None  # those list what is public
+    return path.parent if path.name != "__init__.py" else None  # those only list public names
 
 
-# The measure and its triangles still import each other.
-@pytest.mark.parametrize("top", [one for one in FLOORS if one != "overlap"])
+@pytest.mark.parametrize("top", FLOORS)
 def test_no_folder_imports_the_one_that_it_stands_in(top):
     folders = {}
     for name, others in GRAPH.items():

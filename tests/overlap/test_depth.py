@@ -21,8 +21,8 @@ from helpers import (
 )
 from helpers_depth import DEEP, as_mesh, by_rays, from_pairs, one_beam, overlap, pushes
 
+from spt_jax.overlap.arrays.vectors import area_normals
 from spt_jax.overlap.rays.beam import orthogonal_directions
-from spt_jax.overlap.vectors import area_normals
 
 DIRECTIONS = orthogonal_directions(3)
 

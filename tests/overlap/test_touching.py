@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from helpers import box, join, random_rotation
 
+from spt_jax.overlap.arrays.ranges import unique
 from spt_jax.overlap.exact import ExactOverlap
-from spt_jax.overlap.ranges import unique
 from spt_jax.overlap.surface import ExactSurface
 from spt_jax.overlap.triangles import near_triangles
 from spt_jax.overlap.triangles.determinants import (

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Int
 
-from spt_jax.overlap.ranges import spread, unique
+from spt_jax.overlap.arrays.ranges import spread, unique
 
 # Vertices to a block: of a posed body 20 to 60 blocks are cut.
 _SIZE = 32

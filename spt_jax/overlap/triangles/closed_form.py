@@ -37,11 +37,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, cross, dot, summed
 from spt_jax.overlap.triangles.contours import Contours, senses
 from spt_jax.overlap.triangles.pair_layout import Topology
 from spt_jax.overlap.triangles.pairs import EdgeIntersections
 from spt_jax.overlap.triangles.winding import Ends
-from spt_jax.overlap.vectors import area_normals, cross, dot, summed
 
 # What the sums with constants, of sides of length one, may leave.
 _GAP = 1e-6

@@ -25,9 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, cross, dot
 from spt_jax.overlap.triangles.pair_layout import Topology
 from spt_jax.overlap.triangles.pairs import EdgeIntersections
-from spt_jax.overlap.vectors import area_normals, cross, dot
 
 
 @dataclass(frozen=True)

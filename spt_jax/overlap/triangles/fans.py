@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from spt_jax.overlap.ranges import spread
+from spt_jax.overlap.arrays.ranges import spread
 from spt_jax.overlap.triangles.determinants import BOUND, LEAST, largest_of
 from spt_jax.overlap.triangles.pair_boxes import Shape, cross, parts
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import summed
 from spt_jax.overlap.triangles.faces_cache import FacesCache
-from spt_jax.overlap.vectors import summed
 
 
 @dataclass(frozen=True, eq=False)

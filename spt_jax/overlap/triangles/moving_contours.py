@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, cross, dot, summed
 from spt_jax.overlap.triangles.contours import Contours, barycentric, senses
 from spt_jax.overlap.triangles.pair_layout import Topology
 from spt_jax.overlap.triangles.pairs import EdgeIntersections
-from spt_jax.overlap.vectors import area_normals, cross, dot, summed
 
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # (u, v) of a triangle's corners
 

@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
-from spt_jax.overlap.ranges import spread
+from spt_jax.overlap.arrays.ranges import spread
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared
 
 # Candidates handled at once: bounds the memory for any mesh. A posed body's pairs take 5.0 ms with

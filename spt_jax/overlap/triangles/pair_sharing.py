@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
-from spt_jax.overlap.ranges import unique
+from spt_jax.overlap.arrays.ranges import unique
 
 # A vertex of more clusters than this, the center of a large fan, is left to the comparison of
 # vertices: its pairs of clusters would grow with the square of its triangles.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from spt_jax.overlap.ranges import unique
+from spt_jax.overlap.arrays.ranges import unique
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.near_triangles import NearTriangles
 from spt_jax.overlap.triangles.pair_boxes import concatenate

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.vectors import area_normals, summed
 from spt_jax.overlap.triangles.determinants import (
     BOUND,
     LEAST,
@@ -31,7 +32,6 @@ from spt_jax.overlap.triangles.determinants import (
     whole_coefficient,
     whole_determinants,
 )
-from spt_jax.overlap.vectors import area_normals, summed
 
 # The same against the sum of the products' sizes.
 _RELATIVE = 16 * 2.0**-53

@@ -24,7 +24,7 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
-from spt_jax.overlap.ranges import unique
+from spt_jax.overlap.arrays.ranges import unique
 from spt_jax.overlap.triangles.fans import facing
 from spt_jax.overlap.triangles.gaps import gaps
 from spt_jax.overlap.triangles.pair_boxes import (

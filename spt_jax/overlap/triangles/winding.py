@@ -45,7 +45,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
-from spt_jax.overlap.ranges import spread
+from spt_jax.overlap.arrays.ranges import spread
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.contours import Contours
 from spt_jax.overlap.triangles.manifold import Manifold

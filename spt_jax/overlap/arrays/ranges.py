@@ -1,4 +1,4 @@
-"""Whole numbers, many at once: ranges, and each once."""
+"""Ragged ranges and unique values of integer arrays."""
 
 import numpy as np
 from jaxtyping import Int
