@@ -104,7 +104,8 @@ class World:
 def by_contact_solver(world: World, moved, *args) -> tuple[Any, int, int]:
     """One weight: where it ended, evaluations, products."""
     shape = jax.ShapeDtypeStruct((), moved.dtype)
-    state = SOLVER.init(None, moved, args, {}, shape, None, frozenset())
+    fn = partial(lambda y, args: (world.objective(y, *args), None))
+    state = SOLVER.init(fn, moved, args, {}, shape, None, frozenset())
     for _ in range(_STEPS):
         moved, state, done = world.step(moved, state, *args)
         if done:

@@ -77,6 +77,7 @@ def untangle_frames(
     directions: int,
     folds: "Folds",
     fold_distance: float | None = None,
+    contacts: str | None = None,
     state: State,
     run: "UnfinishedRun | None" = None,
     keep_vertices: bool = True,
@@ -120,6 +121,7 @@ def untangle_frames(
                 translation=translation,
                 folds=folds,
                 fold_distance=fold_distance,
+                contacts=contacts,
                 # It measures with twice as many as it searches with.
                 rays=rays if rays is None else max(rays // 2, 1),
                 directions=directions,

@@ -33,6 +33,7 @@ class MotionOptions(NamedTuple):
     """What `spt-jax untangle` was asked for, as far as motions go."""
 
     fold_distance: float | None
+    contacts: str | None
     fps: float | None
     up: str
     meshes: bool
@@ -76,6 +77,7 @@ def untangle_as_motions(
         say(f"note: {note}", "yellow")
     options = {
         "fold_distance": wanted.fold_distance,
+        "contacts": wanted.contacts,
         "frames_per_second": rate,
         "up": up,
     }

@@ -25,6 +25,7 @@ def untangle(
     body: str = "anny",
     folds: Literal["ignore", "remove", "count"] = "ignore",
     fold_distance: float | None = None,
+    keep_contact: bool = False,
     meshes: bool = False,
     like_input: bool = False,
     together: bool = False,
@@ -72,6 +73,8 @@ def untangle(
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
             0.04 on fingers.
+        keep_contact: parts within 20 mm of each other, such as clapping hands and crossed arms,
+            stay as near as they are.
         meshes: write a .glb of each frame before and after, colored by label; of a motion one
             that plays before and after side by side.
         like_input: write NAME_untangled too, the input in its own structure with the new poses.
@@ -95,6 +98,7 @@ def untangle(
     from spt_jax.io.pose_files import is_pose_file
     from spt_jax.io.rigs.reading import is_rig_file
 
+    contacts = "found" if keep_contact else None
     with user_errors():
         rigged = is_rig_file(poses, max_bytes=max_bytes)
     if rigged:
@@ -119,6 +123,7 @@ def untangle(
                 "directions": 3,
                 "folds": folds,
                 "fold_distance": fold_distance,
+                "contacts": contacts,
             },
             meshes=meshes,
             anew=anew,
@@ -137,6 +142,7 @@ def untangle(
                 body=body != "anny",
                 folds=folds != "ignore",
                 fold_distance=fold_distance is not None,
+                keep_contact=keep_contact,
                 frame_by_frame=frame_by_frame,
                 fps=fps is not None,
                 up=up != "auto",
@@ -180,7 +186,13 @@ def untangle(
             asked,
             body,
             folder,
-            {"rays": rays, "directions": 3, "folds": folds, "fold_distance": fold_distance},
+            {
+                "rays": rays,
+                "directions": 3,
+                "folds": folds,
+                "fold_distance": fold_distance,
+                "contacts": contacts,
+            },
             meshes=meshes,
             anew=anew,
             max_bytes=max_bytes,
@@ -206,7 +218,9 @@ def untangle(
         for note in notes:
             show(err_console(quiet), f"note: {note}", "yellow")
         if whole:
-            wanted = MotionOptions(fold_distance, fps, up, meshes, like_input, anew, json, quiet)
+            wanted = MotionOptions(
+                fold_distance, contacts, fps, up, meshes, like_input, anew, json, quiet
+            )
             return untangle_as_motions(
                 model, motion, asked, pieces, folder, notes, wanted, state, body
             )
@@ -215,6 +229,7 @@ def untangle(
             "directions": 3,
             "folds": folds,
             "fold_distance": fold_distance,
+            "contacts": contacts,
         }
         with user_errors():
             manifest = manifest_of(

@@ -16,11 +16,12 @@ from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax.body import AbstractBody
 from spt_jax.metrics import MotionOverlap
 from spt_jax.overlap.exclusions import Exclusions
-from spt_jax.untangle.anchors import anchors_of, close_pairs
+from spt_jax.untangle.anchors import anchors_of
 from spt_jax.untangle.feet import standing_feet
 from spt_jax.untangle.kept_windows import KeptWindows
-from spt_jax.untangle.motion_input import as_contacts, as_frames, as_positive, as_up
-from spt_jax.untangle.motion_run import MotionStep, Run
+from spt_jax.untangle.motion_contacts import as_motion_contacts, kept_contacts
+from spt_jax.untangle.motion_input import as_frames, as_positive, as_up
+from spt_jax.untangle.motion_run import MotionStep, Run, reach_of
 
 
 class MotionResult(Result):
@@ -128,10 +129,13 @@ def untangle_motion(
             where it is within 5 cm of the lowest place of the motion and slower than 0.3 m/s;
             without a translation, which says neither, where it is within 5 cm of the frame's lowest
             vertex.
-        contacts: contact that is wanted, as pairs of vertices, (contacts, 2), such as of a palm and
-            a hip; of several people numbered through, person * body.num_vertices + vertex. In
-            frames in which the two are within `contact_distance` of each other in the motion given,
-            the squared change of their difference in cm^2 weighs `contact_weight`.
+        contacts: contact that is wanted: "found", the parts that come near each other and are no
+            fold, as `find_contacts` finds them; pairs of patches as `contact_penalty` takes them;
+            or pairs of vertices, (contacts, 2), such as of a palm and a hip; of several people
+            numbered through, person * body.num_vertices + vertex. In frames in which two vertices
+            are within `contact_distance` of each other in the motion given, the squared change of
+            their difference in cm^2 weighs `contact_weight`. Of parts and patches, those vertices
+            are tied that are nearest to each other while the two touch.
         contact_distance: in metres.
         contact_weight: 0 lets contacts go.
         up: the direction that is up.
@@ -153,8 +157,8 @@ def untangle_motion(
             first such frame is named); several people without a translation; shape or translation
             that is not finite or does not fit; a rate or fade that is not positive and finite; a
             margin, fold_distance, distance or weight that is negative or not finite; no direction
-            up; contacts that are no pairs of vertices; a folder to resume in of another motion; a
-            frame in which the body has no surface that could be measured.
+            up; contacts that are no pairs of vertices or patches; a folder to resume in of another
+            motion; a frame in which the body has no surface that could be measured.
         TypeError: poses traced; options that are no numbers.
 
     Differentiation: none; it runs outside jit, and decides by the values it sees.
@@ -168,7 +172,7 @@ def untangle_motion(
         (1, 3)
     """
     frames = as_frames(body, poses, shape, translation)
-    pairs = as_contacts(contacts, body, frames.people)
+    wanted = as_motion_contacts(contacts, body, frames.people)
     asked = _Asked(
         rate=as_positive("frames_per_second", frames_per_second),
         fade=as_positive("fade", fade),
@@ -181,8 +185,8 @@ def untangle_motion(
     direction = as_up(up)
     rest = as_fold_surface(body, fold_distance)
     rest = rest if frames.people == 1 else rest.copies(frames.people)
-    made_from = [*asked, direction, pairs, rest.distances, *frames, *jax.tree.leaves(body)]
-    made_from += [str(jax.tree.structure(body)), translation is None]
+    made_from = [*asked, direction, rest.distances, *frames, *jax.tree.leaves(body)]
+    made_from += [str(jax.tree.structure(body)), translation is None, *jax.tree.leaves(wanted)]
     kept = KeptWindows(resume, made_from)
     run = Run(body, frames, Exclusions(rest=rest), kept, on_step or _nothing)
     before = run.measured(
@@ -194,7 +198,10 @@ def untangle_motion(
         standing = standing_feet(
             body, frames, asked.rate, direction, on_ground=translation is not None
         )
-        touching = close_pairs(body, frames, pairs, asked.contact_distance)
+        reach = reach_of(asked.fade, asked.rate)
+        pairs, touching = kept_contacts(
+            body, frames, wanted, asked.contact_distance, rest, colliding, reach
+        )
         weights = asked.feet * standing.share, asked.contact_weight * touching
         anchors = anchors_of(body, frames, standing.feet, weights[0], pairs, weights[1])
         pose, turns, rounds = run.freed(before, colliding, anchors, asked)

@@ -50,6 +50,11 @@ class MotionStep(NamedTuple):
     colliding: int
 
 
+def reach_of(fade: float, rate: float) -> int:
+    """How many frames from a collision a correction reaches; frames farther off do not move."""
+    return int(np.ceil(_REACH * fade * rate))
+
+
 class Run:
     """A motion that is worked on.
 
@@ -107,7 +112,7 @@ class Run:
         """
         frames, count = self._frames, len(self._frames.pose)
         smoothness = asked.fade * asked.rate
-        reach = int(np.ceil(_REACH * smoothness))
+        reach = reach_of(asked.fade, asked.rate)
         longest = max(int(_LONGEST * smoothness), 4 * reach, _SHORTEST)
         pose = np.array(frames.pose)
         turns = np.zeros((count, frames.people, frames.pose.shape[2] - 1, 3))

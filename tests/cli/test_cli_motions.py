@@ -75,7 +75,9 @@ def test_frame_by_frame_where_that_is_said(tmp_path, capsys, monkeypatch):
     assert main([*words, "--frame-by-frame"]) == 0
     assert "2 frames, 2 collision-free" in capsys.readouterr().out
     assert main([*words, "--frames", "0"]) == 0
-    assert main([*words, "--folds", "count"]) == 0
+    assert main([*words, "--folds", "count", "--keep-contact"]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["settings"]["contacts"] == "found"
     assert "the motion is freed frame by frame" in capsys.readouterr().err
     assert main(["untangle", file, "--out", str(tmp_path / "out"), "--up", "q"]) == 2
 

@@ -105,7 +105,7 @@ def test_an_unknown_pose_file_hears_nothing_of_meshes(name, content, message, tm
 
 
 def test_the_options_of_pose_files_are_refused_for_a_mesh(tmp_path, capsys):
-    for words in (["--people", "1"], ["--like-input"]):
+    for words in (["--people", "1"], ["--like-input"], ["--keep-contact"]):
         assert run(tmp_path / "a.obj", tmp_path / "out", *words) == 2
         assert "is for pose files: got it with a mesh" in capsys.readouterr().err
 

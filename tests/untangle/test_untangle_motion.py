@@ -16,6 +16,8 @@ from spt_jax.untangle import motion_run, motion_window
 from spt_jax.untangle.corrections import Frames, as_given, corrected
 from spt_jax.untangle.feet import feet_of, standing_feet
 from spt_jax.untangle.frame_cuts import FrameCuts
+from spt_jax.untangle.motion_contacts import as_motion_contacts, kept_contacts
+from spt_jax.untangle.motion_input import as_frames
 from spt_jax.untangle.motion_window import windows
 
 
@@ -373,3 +375,39 @@ def test_wanted_contact_is_kept():
             untangle_motion(body, pose, contacts=np.array(wrong))
     with pytest.raises(TypeError, match="whole numbers"):
         untangle_motion(body, pose, contacts=np.array([[0.0, 1.0]]))
+    with pytest.raises(ValueError, match="contacts must be 'found'"):
+        untangle_motion(body, pose, contacts="near")
+    with pytest.raises(ValueError, match="must name triangles"):
+        untangle_motion(body, pose, contacts=[([0], [10**6])])
+
+
+def test_patches_and_parts_are_tied_by_their_nearest_vertices():
+    body, pose = tongs(), snap()
+    frames = as_frames(body, pose, None, None)
+    patches = [tuple(np.flatnonzero(body.part_groups == k) for k in (1, 2))]
+    hit = np.arange(len(pose)) == 20
+    asked = [as_motion_contacts(contacts, body, 1) for contacts in (patches, "found")]
+    both = [kept_contacts(body, frames, x, 0.08, body.rest_surface, hit, 4) for x in asked]
+    for pairs, touching in both:
+        np.testing.assert_array_equal(np.flatnonzero(touching[:, 0]), np.arange(16, 25))
+        near = skin(body, pose)[16:25]
+        arms = [np.unique(body.faces[patch]) for patch in patches[0]]
+        apart = np.linalg.norm(near[:, arms[0]][:, :, None] - near[:, arms[1]][:, None], axis=-1)
+        at = np.unravel_index(apart.argmin(), apart.shape)[1:]
+        assert pairs.tolist() == [[arms[0][at[0]], arms[1][at[1]]]] and touching.shape[1] == 1
+
+
+@pytest.mark.slow
+def test_contact_that_is_found_is_kept():
+    body, pose = tongs(), snap()
+    arms = [np.unique(body.faces[body.part_groups == k]) for k in (1, 2)]
+    change = []
+    for contacts in (None, "found"):
+        result = untangle_motion(body, pose, feet=0.0, contacts=contacts, contact_distance=0.08)
+        assert result.is_free.all()
+        gaps = []
+        for posed in (skin(body, pose), skin(body, result.pose)):
+            apart = posed[:, arms[0]][:, :, None] - posed[:, arms[1]][:, None]
+            gaps.append(np.linalg.norm(apart, axis=-1).min(axis=(1, 2)))
+        change.append(np.abs(gaps[1] - gaps[0])[gaps[0] < 0.08].max())
+    assert change[1] < 0.3 * change[0]  # 38 mm and 8
