@@ -397,7 +397,7 @@ def test_patches_and_parts_are_tied_by_their_nearest_vertices():
         assert pairs.tolist() == [[arms[0][at[0]], arms[1][at[1]]]] and touching.shape[1] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_contact_that_is_found_is_kept():
     body, pose = tongs(), snap()
     arms = [np.unique(body.faces[body.part_groups == k]) for k in (1, 2)]
