@@ -1,10 +1,8 @@
 """The command line: spt-jax demo, check, untangle, fit, clean, measure and view."""
 
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NoReturn
 
 import tyro
 
@@ -13,6 +11,7 @@ from spt_jax.cli.clean import clean
 from spt_jax.cli.compilation import keep_programs
 from spt_jax.cli.demo import demo
 from spt_jax.cli.fit import fit
+from spt_jax.cli.interrupts import hear_again, is_interruption, leave_at_once, say_interrupted
 from spt_jax.cli.measure import measure
 from spt_jax.cli.streams import OutputLostError, guarded_streams
 from spt_jax.cli.terminal import CommandError
@@ -57,6 +56,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _run(args: Sequence[str] | None) -> int:
     if args is None:  # a process of its own, whose environment is nobody else's
         keep_programs()
+        hear_again()
     try:
         return tyro.extras.subcommand_cli_from_dict(
             _COMMANDS,
@@ -75,13 +75,12 @@ def _run(args: Sequence[str] | None) -> int:
             file=sys.stderr,
         )
         return 2
-    except KeyboardInterrupt:
-        return _interrupted(args)
-    except (ValueError, RuntimeError) as error:
-        # What is heard within a callback JAX hands on as one of these, as it is dispatched at once
-        # or not, with the callback's traceback as its text.
-        if "CpuCallback error" in str(error) and "KeyboardInterrupt" in str(error):
-            return _interrupted(args)
+    except (KeyboardInterrupt, ValueError, RuntimeError) as error:
+        if is_interruption(error):
+            code = say_interrupted()
+            if args is None:
+                leave_at_once(code)
+            return code
         # Imported here: not every command measures something.
         from spt_jax.overlap.measure import Unmeasurable
 
@@ -89,19 +88,3 @@ def _run(args: Sequence[str] | None) -> int:
             raise
         print(f"spt-jax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-
-
-def _interrupted(args: Sequence[str] | None) -> int:
-    print("spt-jax: interrupted; no file is left half-written", file=sys.stderr)
-    if args is None:
-        _leave_at_once(130)
-    return 130
-
-
-def _leave_at_once(code: int) -> NoReturn:
-    # The interrupted computation goes on in XLA's threads and calls back into Python; one that
-    # does so while the interpreter shuts down ends the process with a segmentation fault (3 of 4
-    # interrupted demos). Files are whole by now, so there is nothing that shutting down would do.
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)

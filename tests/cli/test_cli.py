@@ -188,6 +188,32 @@ def test_ctrl_c_ends_the_process_cleanly_in_the_middle_of_a_computation(tmp_path
     assert process.returncode == 130 and files_in(out) == []
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT is sent to a process")
+def test_ctrl_c_that_python_ignores_is_raised_again():
+    script = """
+import os, signal, time
+from spt_jax.cli.interrupts import hear_again
+
+class Finalized:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.01)  # it is raised here, where Python ignores it
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+hear_again()
+try:
+    thing = Finalized()
+    del thing
+    print("ignored", flush=True)
+    time.sleep(30)
+except KeyboardInterrupt:
+    print("heard")
+"""
+    command = [sys.executable, "-c", script]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=25)
+    assert (ended.stdout, ended.stderr, ended.returncode) == ("ignored\nheard\n", "", 0)
+
+
 def test_ctrl_c_within_a_callback_is_an_interruption_too(tmp_path, capsys, monkeypatch):
     def hears(*_, **__):
         raise KeyboardInterrupt
