@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Int8
 from spt_jax.overlap.convex import is_small_convex_solid
 from spt_jax.overlap.criteria import CRITERIA
 from spt_jax.overlap.exclusions import Exclusions
+from spt_jax.overlap.folds import expect_folds, only_folds
 from spt_jax.overlap.inflation import Inflated
 from spt_jax.overlap.measure import (
     Gradient,
@@ -121,10 +122,12 @@ def measured(
         exact = options.sampling.rays is None
         if exact and is_small_convex_solid(vertices, faces, options.rounding):
             return np.zeros(()), nothing, None
-        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
-        if faces.size == 0:
+        found = _where_it_counts(vertices, faces, options)
+        if found is None:
             return np.zeros(()), nothing, None
         value = np.array(criterion.of(found, options.rule), np.float64)
+        if options.exclusions.rest is not None:
+            expect_folds(faces, len(vertices), bool(value == 0))
         gradient = nothing
         if with_gradient and criterion.slope is not None:
             gradient = criterion.slope(found)
@@ -137,6 +140,28 @@ def measured(
     value, gradient = _as_held(value, gradient, options.rounding, least=criterion.power > 0)
     known = np.isfinite(value) and (value > 0 or criterion.power <= 0)
     return value, gradient, found if known else None
+
+
+def _where_it_counts(
+    vertices: Vertices, faces: Faces, options: PenaltyOptions
+) -> Measurement | None:
+    """The mesh measured; None where it is shown to be zero by less."""
+    if faces.size == 0:
+        return None
+    # Whether it is asked at first depends on the shapes before. What is returned must not: so
+    # where a measurement fails or falls back on rays it is asked at last.
+    told = options.sampling.rays is None and CRITERIA[options.value].power > 0
+    if told and only_folds(vertices, faces, options.exclusions):
+        return None
+    try:
+        found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
+    except Unmeasurable:
+        if told and only_folds(vertices, faces, options.exclusions, surely=True):
+            return None
+        raise
+    if told and not found.exact and only_folds(vertices, faces, options.exclusions, surely=True):
+        return None
+    return found
 
 
 def _of_sheet(vertices: Vertices, faces: Faces, options: SheetOptions):

@@ -78,13 +78,13 @@ class SurfacePaths:
     @property
     def slack(self) -> float:
         """What rounding to float32 can move a distance by, and twice as much again."""
-        return 8 * float(np.finfo(np.float32).eps) * self._ready().extent
+        return 8 * float(np.finfo(np.float32).eps) * self.table.extent
 
     def bounds(
         self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
         """From below and above, by the paths over the seed nearest to each."""
-        table = self._ready()
+        table = self.table
         over_g = table.flat.take(f * table.seeds + table.nearest.take(g))
         over_f = table.flat.take(g * table.seeds + table.nearest.take(f))
         upper = np.minimum(over_g + table.to_nearest.take(g), over_f + table.to_nearest.take(f))
@@ -97,7 +97,7 @@ class SurfacePaths:
         self, f: Int[np.ndarray, "N"], g: Int[np.ndarray, "N"], distance: float
     ) -> Bool[np.ndarray, "N"]:
         """Whether pairs of one connected part are nearer, for the few that `bounds` leaves open."""
-        table = self._ready()
+        table = self.table
         near = np.zeros(len(f), bool)
         undecided = []
         for start in range(0, len(f), 2048):  # 4 MB a side
@@ -151,7 +151,9 @@ class SurfacePaths:
         )
         return _to_faces(np.ascontiguousarray(to_vertices.T), self.faces).T
 
-    def _ready(self) -> "_Table":
+    @property
+    def table(self) -> "_Table":
+        """Distances from the seeds, made when they are first asked for."""
         table = self._table
         if table is None:
             with self._lock:

@@ -10,6 +10,7 @@ from spt_jax.overlap.surface import parts_in_each_other
 from spt_jax.overlap.triangles.manifold import manifold_of
 from spt_jax.rest.arguments import Levels, as_distances, as_number, as_surface
 from spt_jax.rest.paths import MOST_PIECES, SurfacePaths, surface_paths
+from spt_jax.rest.sets import NearSets
 from spt_jax.rest.thickness import local_radii
 
 
@@ -228,6 +229,22 @@ class RestSurface:
         size = int(part.max()) + 1
         low, high = np.minimum(first, second), np.maximum(first, second)
         return (f // count == g // count) & np.isin(low * size + high, pairs @ [size, 1])
+
+    def near_sets(
+        self, faces: Int[np.ndarray, "N M"], filled: Bool[np.ndarray, "N M"]
+    ) -> NearSets | None:
+        """Which of some sets of faces are near each other for sure, all of the one and the other.
+
+        Args:
+            faces: of each set.
+            filled: which of these entries are faces; the others are not looked at.
+
+        Returns:
+            None where even triangles that share a vertex are not near.
+        """
+        if min(self._levels) <= self._paths.slack or not len(self._paths.faces):
+            return None
+        return NearSets(self._paths, faces, filled, self.distances)
 
     def _bounds(self, f, g):
         if self._copies == 1:

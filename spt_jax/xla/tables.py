@@ -167,7 +167,7 @@ def _place_table(rest: Any) -> PlaceTable:
 
 @functools.lru_cache(maxsize=4)
 def _path_table(paths: SurfacePaths) -> PathTable:
-    table = paths._ready()
+    table = paths.table
     nearest = np.asarray(table.nearest, np.int32)
     found = PathTable(paths._longest, table.rows, nearest, table.to_nearest, table.from_nearest)
     return _on_device(found)
@@ -184,7 +184,7 @@ def _slim_faces(paths, allowed: Float[np.ndarray, "F"]) -> Int[np.ndarray, "S"]:
 
     None where listing what is near them would take more than `_MOST_LISTED` bytes.
     """
-    seeds = paths._ready().to_nearest
+    seeds = paths.table.to_nearest
     to_seed = float(seeds.max(initial=0.0, where=np.isfinite(seeds)))
     slim = np.flatnonzero(allowed < 2 * to_seed)
     return slim if len(slim) * len(allowed) <= 8 * _MOST_LISTED else slim[:0]

@@ -194,12 +194,19 @@ class NearTriangles:
         return t[kept], u[kept]
 
     def _straddling(self, t, u):
-        corners, count = self.layout.corners, self._predicates.points.shape[1]
-        for turn in (0, 1):
-            x, y = (t, u) if turn else (u, t)
-            plane, corner = corners.take(y, axis=1), corners.take(x, axis=1)
-            key = y * count + corner
-            side, _ = self._predicates.volume(plane, corner, key, if_alike=True)
-            kept = np.flatnonzero(np.abs(side.sum(axis=0)) < 3)
-            t, u = t[kept], u[kept]
-        return t, u
+        return straddling(self._predicates, self.layout, t, u)
+
+
+def straddling(
+    predicates: Predicates, layout: Layout, t: Int[np.ndarray, "N"], u: Int[np.ndarray, "N"]
+) -> tuple[Int[np.ndarray, "M"], Int[np.ndarray, "M"]]:
+    """Those of some pairs of slots each of which has corners on both sides of the other's plane."""
+    corners, count = layout.corners, predicates.points.shape[1]
+    for turn in (0, 1):
+        x, y = (t, u) if turn else (u, t)
+        plane, corner = corners.take(y, axis=1), corners.take(x, axis=1)
+        key = y * count + corner
+        side, _ = predicates.volume(plane, corner, key, if_alike=True)
+        kept = np.flatnonzero(np.abs(side.sum(axis=0)) < 3)
+        t, u = t[kept], u[kept]
+    return t, u

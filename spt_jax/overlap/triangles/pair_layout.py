@@ -111,6 +111,8 @@ class Prepared:
     usual_pairs: int = 0  # of groups whose boxes meet
     kept: tuple[Any, ...] = ()  # `warm_pairs.Kept`, the last one used first
     waste: int = 0  # how many more shapes were kept than were of use
+    at_rest: Any = None  # `folds.AtRest`, of the layout
+    collided: int = 0  # shapes in a row in which not all intersections were folds
 
     def arrange(self, box: Float[np.ndarray, "F 6"]) -> Layout:
         """A new layout, for this shape (each face's lowest and highest corner) and earlier ones."""

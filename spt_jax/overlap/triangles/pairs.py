@@ -134,7 +134,7 @@ def find_intersections(
     if among is not None:
         kept = _edges_of(topology, among)[topology.edge_id[row]] | among[layout.face[slot]]
         row, slot = row[kept], slot[kept]
-    row, slot, part, jump = _decide(predicates, topology, layout, row, slot)
+    row, slot, part, jump = decided(predicates, topology, layout, row, slot)
     face = layout.face[slot]
     order = np.lexsort((face, row))
     row, face, part, jump = row[order], face[order], part[order], jump[order]
@@ -197,7 +197,7 @@ def _edges_of_pairs(topology: Topology, layout: Layout, t, u):
     return row[kept], slot[kept]
 
 
-def _decide(predicates: Predicates, topology: Topology, layout: Layout, row, slot):
+def decided(predicates: Predicates, topology: Topology, layout: Layout, row, slot):
     """The candidates that cross, what part of the edge lies before the crossing, and the jump."""
     corners, ends = layout.corners.take(slot, axis=1), topology.ends.take(row, axis=0).T
     side, height = predicates.volume(corners, ends)

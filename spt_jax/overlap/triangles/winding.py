@@ -166,7 +166,7 @@ def winding_numbers(
     first, second = np.concatenate(links, axis=1)
     step = np.concatenate(steps)
 
-    root, value = _roots(topology, manifold, predicates, layers, times)
+    root, value = roots_of(topology, manifold, predicates, layers, times)
     where = at_cusp[2 * root.row + root.end]
     where = np.where(where >= 0, where, node[topology.ends[root.row, root.end]])
     winding = _spread_from(where, value, first, second, step, size)
@@ -249,7 +249,7 @@ def _extremes(topology: Topology, manifold: Manifold, predicates: Predicates):
     return names, extreme
 
 
-def _roots(topology: Topology, manifold: Manifold, predicates: Predicates, layers, times):
+def roots_of(topology: Topology, manifold: Manifold, predicates: Predicates, layers, times):
     """An edge's end in each part that has triangles, and the winding number there."""
     faces = topology.faces
     names, extreme = _extremes(topology, manifold, predicates)
