@@ -1,5 +1,6 @@
 """Strictness for the whole suite: types checked, promotions explicit, both precisions run."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -32,6 +33,10 @@ if "XLA_FLAGS" not in os.environ:
         [sys.executable, "-c", "import jax; jax.devices()"], env=flags, capture_output=True
     )
     os.environ["XLA_FLAGS"] = _QUICK if asked.returncode == 0 else ""
+
+# Compiled programs are many objects that live to the end: looking through all of them for garbage
+# took 4 % of a worker's time. The tests of what is given back collect it themselves.
+gc.set_threshold(700, 10, 60)
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -188,9 +188,15 @@ def swung(angle, dtype="float32"):
     return jnp.zeros((3, 3), dtype).at[1, 1].set(angle)
 
 
-@pytest.mark.parametrize("rays", [None, 64])
-@pytest.mark.parametrize("folds", ["ignore", "count"])
-@pytest.mark.parametrize("rate", [1e30, 1e4])
+@pytest.mark.parametrize(
+    ("folds", "rays", "rate"),
+    [
+        ("ignore", None, 1e30),
+        ("count", None, 1e4),
+        pytest.param("ignore", 64, 1e4, marks=pytest.mark.slow),
+        pytest.param("count", 64, 1e30, marks=pytest.mark.slow),
+    ],
+)
 def test_a_solver_that_runs_away_is_told_and_its_places_are_not_taken(folds, rays, rate):
     seen = []
     running = optx.GradientDescent(learning_rate=rate, rtol=1e-9, atol=1e-9)

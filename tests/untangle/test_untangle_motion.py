@@ -283,6 +283,7 @@ def pair_of_people(frames=21, apart=0.42):
     return pose, places
 
 
+@pytest.mark.slow
 def test_two_people_are_freed_together_and_counted_apart():
     body, (pose, places) = tongs(), pair_of_people()
     result = untangle_motion(body, pose, translation=places)
@@ -351,6 +352,7 @@ def test_a_run_that_was_ended_goes_on_to_the_same_bits(tmp_path, monkeypatch):
         untangle_motion(body, pose, resume=tmp_path, margin=0.003)
 
 
+@pytest.mark.slow
 def test_wanted_contact_is_kept():
     """The tips of the two arms touch all the while; freeing the arms alone pulls them apart."""
     body, pose = tongs(), snap()
