@@ -36,6 +36,7 @@ from spt_jax.overlap.measure import Gradient, Rule, Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.rest.surface import RestSurface
 from spt_jax.xla.backend import Program, Task, as_task, penalty_on_device
+from spt_jax.xla.holes import closed_on_device
 from spt_jax.xla.settings import Xla
 
 
@@ -109,7 +110,8 @@ def self_intersection_penalty(
             arrays: in JAX alone, where the vertices are; "auto": "numpy", also where JAX runs on a
             GPU or TPU, since that alone is exact. "xla" measures by rays, 512 by default, and
             decides folds and groups by what the rays meet (`spt_jax.xla`; `python -m
-            benchmarks.device` prints how far off it is).
+            benchmarks.device` prints how far off it is). It closes holes where every overlap counts
+            and the faces are known; else rays through a hole are left out, with a warning.
         second_order: whether the volume has its own second derivatives, and forward mode. They are
             exact wherever the volume has them: everywhere but where surfaces touch. A product with
             the Hessian costs a fifth of the gradient that it comes with, with a margin as much as
@@ -185,7 +187,12 @@ def self_intersection_penalty(
         program = Program(device, options.sampling.rays, options.value, None, options.rule)
         task = as_task(program, options.sampling, vertices.dtype, options.exclusions)
         way = program, options.gradient
-        return _on_device(way, vertices, jnp.asarray(faces), task.tables)
+        too_large = None
+        if (options.value, options.gradient) == ("volume", "boundary"):
+            whole = not options.exclusions.any
+            vertices, faces, too_large = closed_on_device(vertices, faces, everything=whole)
+        found = _on_device(way, vertices, jnp.asarray(faces), task.tables)
+        return found if too_large is None else jnp.where(too_large, jnp.nan, found)
     if isinstance(faces, Tracer):
         return differentiable(options, None, vertices, faces)
     return differentiable(options, Known(np.asarray(faces)), vertices, ())
