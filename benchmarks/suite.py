@@ -2,10 +2,13 @@
 
 Every metric has a name, a unit and a direction. All calls of a block are timed turn about in one
 process, so that a machine that slows down slows all of them; what is compared are ratios of
-medians. `--record` writes the tables, the plots of growth and baseline.json; `--gate` measures
-again and fails where a ratio is worse than the baseline's by more than its tolerance.
+medians. Lists of what is near what are kept from call to call, so no call of ours is given a shape
+that was seen before, or one near it: each is larger than the last. `--record` writes the tables,
+the plots of growth and baseline.json; `--gate` measures again and fails where a ratio is worse than
+the baseline's by more than its tolerance.
 """
 
+import itertools
 import json
 import subprocess
 import sys
@@ -56,6 +59,30 @@ class Metric(NamedTuple):
     tolerance: float = TOLERANCE  # of the gate; only ratios are held to it
 
 
+class Larger:
+    """A call of a mesh, or of several, in ever other sizes.
+
+    Args:
+        call: what is called.
+        mesh: vertices; each call's are larger than the last one's by a sixteenth of these, whatever
+            call that was.
+    """
+
+    _sizes = itertools.count()
+
+    def __init__(self, call: Callable[[Any], Any], mesh: Any):
+        self._call, self._mesh = call, mesh
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Make the next size."""
+        self._given = jax.block_until_ready(self._mesh * (1 + next(Larger._sizes) / 16))
+
+    def __call__(self) -> Any:
+        """Call it with the size that was made last."""
+        return self._call(self._given)
+
+
 def timed(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, np.ndarray]:
     """Milliseconds of each call, turn about, after one of each that is not counted."""
     taken: dict[str, list[float]] = {name: [] for name in calls}
@@ -64,6 +91,8 @@ def timed(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, np.
         for turn in range(repeats + 1):
             for name, call in calls.items():
                 callback.clear_results()
+                if isinstance(call, Larger):
+                    call.prepare()
                 start = time.perf_counter()
                 jax.block_until_ready(call())
                 if turn:
@@ -79,14 +108,14 @@ def own_calls(vertices: jax.Array, faces: Any) -> dict[str, Callable[[], Any]]:
         call = jax.jit(
             jax.value_and_grad(lambda v: self_intersection_penalty(v, faces, **options).sum())
         )
-        return lambda: call(vertices)
+        return Larger(call, vertices)
 
     labels = jax.jit(lambda v: classify_vertices(v, faces).labels)
     return {
         DEFAULT: penalty(),
         ONE: penalty(rays=RAYS, directions=1),
         THREE: penalty(rays=RAYS),
-        "labels, vertex rule": lambda: labels(vertices),
+        "labels, vertex rule": Larger(labels, vertices),
     }
 
 
@@ -135,7 +164,9 @@ def end_to_end(repeats: int) -> tuple[Table, list[Metric]]:
     single = jax.jit(jax.value_and_grad(lambda v: self_intersection_penalty(v, body.faces)))
     many = jax.jit(jax.value_and_grad(lambda v: self_intersection_penalty(v, body.faces).sum()))
     through = jax.jit(
-        jax.value_and_grad(lambda p: self_intersection_penalty(body(p).vertices, body.faces))
+        jax.value_and_grad(
+            lambda p, size: self_intersection_penalty(size * body(p).vertices, body.faces)
+        )
     )
     alone = jax.jit(jax.value_and_grad(lambda p: jnp.sum(body(p).vertices ** 2)))
 
@@ -143,7 +174,7 @@ def end_to_end(repeats: int) -> tuple[Table, list[Metric]]:
     results = ((), "float32"), (tuple(vertices.shape), "float32")
     empty = jax.jit(lambda v: callback.call_on_host(_nothing, (), results, v, body.faces))
 
-    def on_the_host():
+    def on_the_host(points):
         found = host_measurement(points, faces)
         return found.volume, found.gradient("boundary", "vertex")
 
@@ -154,11 +185,11 @@ def end_to_end(repeats: int) -> tuple[Table, list[Metric]]:
     times = timed(
         {
             "body and its gradient": lambda: alone(pose),
-            "body + penalty + gradient": lambda: through(pose),
-            "penalty + gradient": lambda: single(vertices),
-            "the same in NumPy alone": on_the_host,
-            "16 bodies one by one": lambda: [single(v) for v in batch],
-            "16 bodies, one batch": lambda: many(batch),
+            "body + penalty + gradient": Larger(lambda x: through(pose, x), jnp.ones(())),
+            "penalty + gradient": Larger(single, vertices),
+            "the same in NumPy alone": Larger(on_the_host, points),
+            "16 bodies one by one": Larger(lambda x: [single(v) for v in x], batch),
+            "16 bodies, one batch": Larger(many, batch),
         },
         repeats,
     )

@@ -111,3 +111,30 @@ def test_a_solve_can_be_jitted_and_batched(dtype):
     for start, end in zip(starts, together, strict=True):
         assert overlap(end) < 0.1 * overlap(start)
         np.testing.assert_allclose(end, jax.jit(solve)(start), atol=2e-2)
+
+
+def test_bfgs_ends_at_a_minimum_where_the_loss_is_not_small():
+    """BFGS drops what a step tells where step times change of gradient is below epsilon.
+
+    That is an absolute bound (optimistix, `_solver/quasi_newton.py`), so where it bites depends on
+    the loss's unit alone: the same loss in thousandths goes on as plain gradient descent, in units
+    it ends where starting again reaches no lower.
+    """
+    stretch = jnp.array([1.0, 0.1, 3.0], jnp.float32)  # as joints differ in what they move
+
+    def loss(x, factor):
+        vertices = jnp.asarray(VERTICES, x.dtype).at[HALF:].add(stretch * x)
+        value = self_intersection_penalty(vertices, FACES) + 0.01 * jnp.sum(x**2)
+        return factor * value
+
+    solver = optx.BFGS(rtol=1e-4, atol=1e-4)
+
+    @jax.jit
+    def searched(x, factor):
+        found = optx.minimise(loss, solver, x, factor, max_steps=100, throw=False)
+        return found.value, loss(found.value, 1.0)
+
+    start = jnp.zeros(3, jnp.float32)
+    thousandths, (x, units) = searched(start, jnp.float32(1e-3))[1], searched(start, jnp.float32(1))
+    assert searched(x, jnp.float32(1))[1] > 0.99 * units
+    assert thousandths > 20 * units
