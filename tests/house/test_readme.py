@@ -5,6 +5,13 @@ import re
 from pages import TOP, printed_by, python_blocks
 
 README = (TOP / "README.md").read_text(encoding="utf-8")
+RESULTS = (TOP / "benchmarks" / "results.md").read_text(encoding="utf-8")
+# For each row of the README's table, in turn, the recorded section that prints its figures.
+SECTIONS = (
+    *("untangle", "untangle", "untangle-mesh", "exactness", "exactness", "exactness"),
+    *("speed", "suite", "folds", "pose_table_1"),
+)
+FIGURE = r"\d[\d,]*(?:\.\d+)?(?:e-?\d+)?"
 
 
 def test_the_snippet_frees_the_pose():
@@ -32,3 +39,19 @@ def test_pictures_and_pages_exist():
 
 def test_it_is_a_screen_and_a_half():
     assert len(README.splitlines()) <= 120
+
+
+def _figures(text):
+    return [figure.replace(",", "") for figure in re.findall(FIGURE, text)]
+
+
+def test_measured_figures_are_those_that_a_benchmark_recorded():
+    table = README[README.index("## Measured") : README.index("## What it does not do")]
+    rows = re.findall(r"^\| (.+) \| (.+) \|$", table, re.MULTILINE)
+    assert len(rows) == len(SECTIONS)
+    for (what, values), section in zip(rows, SECTIONS, strict=True):
+        start, end = (RESULTS.index(f"<!-- {section}:{edge} -->") for edge in ("start", "end"))
+        recorded = [float(figure) for figure in _figures(RESULTS[start:end])]
+        for figure in _figures(values):
+            digits = len(figure.split("e")[0].replace(".", "").lstrip("0")) or 1
+            assert float(figure) in {float(f"{x:.{digits}g}") for x in recorded}, (what, figure)
