@@ -35,7 +35,7 @@ def clean(
         body: "anny", the body that comes with the package, or a body model file.
         structure: of what is written: "input", each file's own, or "amass", an .npz a person.
         frame_rate: of files that say none, in frames a second.
-        fade: the time in which a correction comes and goes, in seconds.
+        fade: the time in which a correction comes and goes in a fast motion, in seconds.
         fold_distance: how near to each other, along the skin at rest and in metres, what intersects
             is a fold; not given: as near as the place allows.
         margin: how far apart colliding parts are pushed, in metres.

@@ -5,7 +5,8 @@ A correction has one vector y_t a frame. Its cost is that of a smooth prior,
     sum over t of |y_t|^2 + 2 s^2 |y_t+1 - y_t|^2 + s^4 |y_t+1 - 2 y_t + y_t-1|^2 = y' (K x I) y,
 
 the energy |y - s^2 y''|^2 whose answer to a push in one frame is (1 + |t| / s) exp(-|t| / s): it
-fades over s frames and never swings to the other side (a Matérn kernel of order 3/2). Collisions
+fades over s frames and never swings to the other side (a Matérn kernel of order 3/2). Where s
+varies, it is that of the frames at which the differences are taken (`pace`). Collisions
 are known by cuts, planes under the convex functions c_t(y_t) that the roots of the penalties nearly
 are (`contact_solver`). What is sought is
 
@@ -88,7 +89,7 @@ def prior(
     fixed_before: Float[np.ndarray, "B N"],
     free: int,
     fixed_after: int,
-    smoothness: float,
+    smoothness: float | Float[np.ndarray, "F"],
 ) -> Prior:
     """The prior of `free` frames between frames whose correction is known.
 
@@ -97,15 +98,17 @@ def prior(
         free: how many frames there are to be found.
         fixed_after: how many frames after have no correction; none where the motion ends there, or
             the rest of it is found later.
-        smoothness: s, in frames.
+        smoothness: s of each frame, in frames, of those before and after too.
     """
     before = len(fixed_before)
     count = before + free + fixed_after
     matrix = np.eye(count)
-    for order, factor in ((1, 2 * smoothness**2), (2, smoothness**4)):
+    smoothness = np.broadcast_to(smoothness, count)
+    between = smoothness[1:] * smoothness[:-1]
+    for order, factor in ((1, 2 * between), (2, smoothness[1:-1] ** 4)):
         if count > order:
             difference = np.diff(np.eye(count), n=order, axis=0)
-            matrix += factor * difference.T @ difference
+            matrix += (difference.T * factor) @ difference
     chosen = slice(before, before + free)
     kernel = np.linalg.inv(matrix[chosen, chosen])
     kernel = (kernel + kernel.T) / 2

@@ -104,9 +104,11 @@ def untangle_motion(
 
         d_t + 2 s^2 d(first difference of the correction) + s^4 d(second difference) + w_t V_t
 
-    is made small, s the time `fade` in frames, with weights w_t that grow where frames collide
+    is made small, s a time in frames, with weights w_t that grow where frames collide
     until they do so no more; what feet and contacts
-    ask for is added. The correction is a turn of every joint but the root, in the axes of
+    ask for is added. How long s is, follows from `fade` and from how fast the motion is there: slow
+    ones would be seen to shake, fast ones need not be moved long before they collide. The
+    correction is a turn of every joint but the root, in the axes of
     its own part, so that it moves along with the limb. Frames farther than five times `fade` from
     any collision come back unchanged to the bit; folds, the creases that skinning makes at
     armpits, elbows and groins, are left as they are.
@@ -120,8 +122,9 @@ def untangle_motion(
             person, or one for each person in each frame. Held fixed.
         translation: in metres, likewise; several people must have one.
         frames_per_second: the motion's rate.
-        fade: the time in which a correction comes and goes, in seconds. Longer is smoother and
-            moves more frames.
+        fade: the time in which a correction comes and goes, in seconds, where the fastest vertex
+            accelerates by 45 m/s^2, as in a kick; up to 2.5 times as long where the motion is
+            slower, down to a quarter where it is faster. Longer is smoother and moves more.
         fold_distance: as in `untangle_pose`.
         margin: how far apart colliding parts are pushed, in metres.
         feet: what the squared displacement in cm^2 of the middle of a foot that stands on the

@@ -15,6 +15,7 @@ from spt_jax.untangle.corrections import Corrections, Frames
 from spt_jax.untangle.frame_cuts import prior
 from spt_jax.untangle.kept_windows import KeptWindows
 from spt_jax.untangle.motion_window import measured_poses, solve, windows
+from spt_jax.untangle.pace import paces
 
 # Calm frames that are moved along on either side of a collision, in units of the time in which a
 # correction fades: there it has come down to a twenty-fifth.
@@ -113,6 +114,7 @@ class Run:
         frames, count = self._frames, len(self._frames.pose)
         smoothness = asked.fade * asked.rate
         reach = reach_of(asked.fade, asked.rate)
+        pace = paces(self._body, frames, asked.rate, asked.fade) * asked.rate
         longest = max(int(_LONGEST * smoothness), 4 * reach, _SHORTEST)
         pose = np.array(frames.pose)
         turns = np.zeros((count, frames.people, frames.pose.shape[2] - 1, 3))
@@ -127,7 +129,7 @@ class Run:
                 after = min(2, count - end) if closed else 0
                 solved = solve(
                     corrections,
-                    prior(earlier, len(chosen), after, smoothness),
+                    prior(earlier, len(chosen), after, pace[first - len(earlier) : end + after]),
                     anchors.at(chosen),
                     before.at(chosen),
                     self._exclusions,
