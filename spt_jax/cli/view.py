@@ -10,6 +10,7 @@ from spt_jax.cli.terminal import CommandError, err_console, out_console, show, u
 
 def view(
     file: tyro.conf.Positional[Path | None] = None,
+    beside: Path | None = None,
     port: int = 8080,
     host: str = "127.0.0.1",
     upload_limit: int = 256,
@@ -25,6 +26,8 @@ def view(
         file: poses (.npz), a mesh (.ply, .obj, .stl, .off, .glb), a rigged character with its
             animations (.glb, .gltf, .vrm), or an SMPL, SMPL-H or SMPL-X model (.npz, .pkl); the
             body that comes with the package if not given.
+        beside: poses of the same people and frames, such as those of the file untangled, which are
+            shown beside them and play along.
         port: of the page; the next free one if it is taken.
         host: the address to serve on. Other machines reach a view on 0.0.0.0, without encryption;
             whoever has the address that is printed, with its token, can use it.
@@ -43,7 +46,12 @@ def view(
     try:
         with user_errors():
             served = View(
-                file, host=host, port=port, upload_limit=upload_limit, max_bytes=max_bytes
+                file,
+                beside=beside,
+                host=host,
+                port=port,
+                upload_limit=upload_limit,
+                max_bytes=max_bytes,
             )
     except ImportError as error:
         raise CommandError(" ".join(str(error).split())) from error

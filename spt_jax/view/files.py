@@ -33,6 +33,7 @@ class Frames:
     pose: Float[np.ndarray, "N J 3"]
     shape: Float[np.ndarray, "N B"] | None = None
     translation: Float[np.ndarray, "N 3"] | None = None
+    rate: float = 30.0  # frames a second
 
     def load_into(self, scene: Scene, row: int) -> None:
         """Show one frame."""
@@ -92,7 +93,7 @@ def _rigged(path: Path, name: str | None, max_bytes: int | None) -> Rigged:
         names = [clip.name] if clip.frame_rate is None else []
         names = names or [f"{clip.name}/{row:04d}" for row in range(len(clip.times))]
         arrays = (x.astype(np.float32) for x in (clip.pose, clip.shape, clip.translation))
-        motions[clip.name] = Frames(names, *arrays)
+        motions[clip.name] = Frames(names, *arrays, rate=clip.frame_rate or 30.0)
     return Rigged(Scene.of_body(rig.body, name or path.stem), motions, tuple(notes))
 
 
@@ -166,7 +167,8 @@ def frames_for(given: Track, body: AbstractBody, *, embedded: bool) -> tuple[Fra
         shown = ", ".join(lost[:4]) + (", ..." if len(lost) > 4 else "")
         notes.append(f"The body lacks {shown}: their rotations are left out.")
     pose = np.asarray(body.pose_from_smpl(given.pose.astype(np.float32)))
-    return Frames(list(given.names), pose, shape, given.translation), notes
+    rate = given.frame_rate or 30.0
+    return Frames(list(given.names), pose, shape, given.translation, rate), notes
 
 
 def motions_of(

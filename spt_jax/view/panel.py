@@ -37,6 +37,7 @@ class Panel:
     ):
         self._gui, self._scene, self._motions, self._do = server.gui, scene, motions, do
         self._parts = body_parts(scene.body.joint_names) if scene.body else {}
+        self.free_motion: Any = None
         self._gui.reset()
         self._gui.configure_theme(
             show_logo=False,
@@ -47,6 +48,7 @@ class Panel:
         self._gui.set_panel_label("spt-jax view")
         self._gui.main_panel.dock_right()
         self._figures = self._gui.add_html("")
+        self._beside = self._gui.add_html("")
         self._buttons()
         if scene.body is not None:
             self._pose_widgets(first)
@@ -59,9 +61,22 @@ class Panel:
         """Write what was measured."""
         self._figures.content = figures(reading, self._scene, status)
 
+    def show_beside(self, reading: Reading | None, scene: Scene | None) -> None:
+        """Write what was measured of what stands beside, if anything does."""
+        shown = reading is not None and scene is not None
+        content = figures(reading, scene, "", "spt-figures-beside") if shown else ""
+        if self._beside.content != content:
+            self._beside.content = content
+
+    def show_frame(self, row: int) -> None:
+        """Move the frame slider along with what plays."""
+        self.frame.value = row
+
     def show_busy(self, busy: bool) -> None:
         """Only `stop` can be pressed while the scene is untangled."""
         self.untangle.disabled = busy
+        if self.free_motion is not None:
+            self.free_motion.disabled = busy
         self.stop.visible = busy
 
     def show_state(self) -> None:
@@ -130,6 +145,12 @@ class Panel:
                 last = max(1, len(self._motions[motion].names) - 1)
                 self.frame = gui.add_slider("Frame", 0, last, 1, row)
                 self.motion = choice
+                hint = "Run through the frames, at the motion's rate where that can be shown"
+                self.play = gui.add_checkbox("Play", False, hint=hint)
+                hint = "Move all frames apart by untangle_motion, and show the result beside"
+                self.free_motion = gui.add_button("Untangle motion", hint=hint)
+                self._on(self.play, "play", "set_playing")
+                self._on(self.free_motion, "untangle", "untangle_motion", click=True, value=False)
                 self._on(choice, "motion", "choose_motion")
                 self._on(self.frame, "frame", "choose_frame")
             part = _FIRST_PART if _FIRST_PART in self._parts else next(iter(self._parts))
@@ -207,8 +228,8 @@ def _within(slider: Any, value: float) -> float:
     return round(float(np.clip(value, slider.min, slider.max)), 2) + 0.0
 
 
-def figures(reading: Reading, scene: Scene, status: str) -> str:
-    """What was measured, as HTML."""
+def figures(reading: Reading, scene: Scene, status: str, name: str = "spt-figures") -> str:
+    """What was measured, as HTML in a box of this name."""
     volume, ratio = volume_text(reading.volume, scene), f"{reading.counts.ratio:.2%}"
     if reading.error is not None:
         volume = ratio = "not measured"
@@ -226,7 +247,7 @@ def figures(reading: Reading, scene: Scene, status: str) -> str:
         for name, value in rows
     )
     return (
-        '<div id="spt-figures" style="padding:0.2em 1em 0.4em 1em;font-size:0.8em;'
+        f'<div id="{name}" style="padding:0.2em 1em 0.4em 1em;font-size:0.8em;'
         f'font-variant-numeric:tabular-nums" data-volume="{reading.volume!r}" '
         f'data-status="{escape(status)}">'
         f'<div style="font-size:2.3em;font-weight:650;line-height:1.25">{large}</div>'

@@ -14,7 +14,8 @@ from spt_jax.body import load_body
 from spt_jax.io.pose_files import MotionFile
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
-from spt_jax.view.freeing import untangle_scene
+from spt_jax.view.beside import Beside, Player, freed, matched
+from spt_jax.view.freeing import Stopped, untangle_scene
 from spt_jax.view.guarded import (
     PATIENCE,
     drop_removed_nodes,
@@ -46,6 +47,8 @@ class View:
 
     Args:
         file: poses, a mesh or an SMPL model to begin with; the embedded body if None.
+        beside: poses of the same people and frames, such as those of `file` untangled, that are
+            shown beside them.
         host: address to serve on; who can reach it still needs the token of `url`.
         port: the next free one is taken where it is in use.
         upload_limit: of a file that a browser sends, in megabytes.
@@ -62,6 +65,7 @@ class View:
         self,
         file: Path | None = None,
         *,
+        beside: Path | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
         upload_limit: int = UPLOAD_LIMIT,
@@ -71,6 +75,11 @@ class View:
         viser = import_viser()
         self.access, numeric = access_for(host)
         opened = None if file is None else files.open_file(file, max_bytes=max_bytes)
+        other = None if beside is None else files.open_file(beside, max_bytes=max_bytes)
+        if other is not None and not (
+            isinstance(other, MotionFile) and isinstance(opened, MotionFile)
+        ):
+            raise ValueError("beside must be poses, beside a file of poses: got another kind.")
         self._max_bytes = max_bytes
         port = free_port(numeric, port)
         self.server = start_guarded(viser, self.access, numeric, port, patience)
@@ -81,10 +90,14 @@ class View:
         self._status = "ready"
         self._motions: dict[str, files.Frames] = {}
         self._embedded = True
+        self._beside: Beside | None = None
         self.worker = Worker(self._refresh, self._report)
+        self._player = Player(self.worker, self._advance, self._rate)
         try:
             name = None if file is None else file.name
             self._take(opened if opened is not None else _embedded_body(), name, first=True)
+            if isinstance(other, MotionFile) and isinstance(opened, MotionFile):
+                self._put_beside(self._matched(opened, other, beside.name))  # type: ignore
         except Exception:
             stop_quietly(self.server)
             raise
@@ -109,6 +122,7 @@ class View:
     def stop_serving(self, timeout: float = 5.0) -> bool:
         """End the server; whether the work under way ended too."""
         self._stop.set()
+        self._player.play(False)
         ended = self.worker.stop(timeout)
         drop_who_does_not_read(self.server)
         stop_quietly(self.server)
@@ -126,7 +140,13 @@ class View:
         frames = self._motions[self.panel.motion.value]
         row = min(int(row), len(frames.names) - 1)
         frames.load_into(self.scene, row)
+        if self._beside is not None:
+            self._beside.load(self.panel.motion.value, row)
         self._status = frames.names[row]
+
+    def set_playing(self, wanted: bool) -> None:
+        """Run through the frames of the motion, or stand still."""
+        self._player.play(wanted)
 
     def choose_part(self, part: str) -> None:
         """Put the handles on another part of the body."""
@@ -189,6 +209,29 @@ class View:
             self.panel.show_busy(False)
         self._status = "stopped" if self._stop.is_set() else _outcome(before, self.scene.read())
 
+    def untangle_motion(self) -> None:
+        """Untangle all frames of the motion as one, and show what comes of it beside."""
+        motion, body = self.panel.motion.value, self.scene.body
+        self._stop.clear()
+        self._untangling = True
+        self.panel.show_busy(True)
+        reading = self.scene.read()
+        try:
+            frames, outcome = freed(
+                body,  # pyright: ignore[reportArgumentType]
+                self._motions[motion],
+                lambda text: self._show(reading, text),
+                self._stop.is_set,
+            )
+        except Stopped:
+            self._status = "stopped"
+            return
+        finally:
+            self._untangling = False
+            self.panel.show_busy(False)
+        self._put_beside(Beside(body, "the motion untangled", {motion: frames}))  # type: ignore
+        self._status = outcome
+
     def open_upload(self, name: str, content: bytes) -> None:
         """Show a file that a browser sent; a bad one changes nothing."""
         opened = files.open_upload(name, content, max_bytes=self._max_bytes)
@@ -216,6 +259,29 @@ class View:
         if action == "stop":
             return
         self.worker.post(key, lambda: getattr(self, action)(*arguments, **keywords))
+
+    def _rate(self) -> float:
+        return self._motions[self.panel.motion.value].rate
+
+    def _advance(self, gone: int) -> None:
+        count = len(self._motions[self.panel.motion.value].names)
+        row = (int(self.panel.frame.value) + gone) % count
+        self.panel.show_frame(row)
+        self.choose_frame(row)
+
+    def _matched(self, opened: MotionFile, other: MotionFile, name: str) -> Beside:
+        body = self.scene.body
+        shown, _ = files.motions_of(opened, "", body, embedded=self._embedded)  # type: ignore
+        named = dict(zip(self._motions, shown.values(), strict=False))  # the file's come first
+        others, notes = files.motions_of(other, "", body, embedded=self._embedded)  # type: ignore
+        self._notes += [note for note in notes if note not in self._notes]
+        return Beside(body, name, matched(named, others))  # type: ignore
+
+    def _put_beside(self, beside: Beside) -> None:
+        self._beside = beside
+        beside.load(self.panel.motion.value, int(self.panel.frame.value))
+        self._stage.begin(self.scene, self.scene.read(), pair=True)
+        self._stage.set_handles(self.scene, self.panel.joints, self._turned)
 
     def _turned(self, joint: int, wxyz: tuple[float, ...]) -> None:
         self._do(("handle", joint), "turn_in_world", joint, wxyz)
@@ -256,7 +322,8 @@ class View:
         reading = scene.read()  # distances along the surface at rest take two seconds, once
         if reading.error is not None:
             raise ValueError(reading.error)
-        self.scene, self._motions = scene, motions
+        self._player.play(False)
+        self.scene, self._motions, self._beside = scene, motions, None
         self._status = "ready" if start is None else motions[start[0]].names[start[1]]
         drop_removed_nodes(self.server)
         self._stage.begin(scene, reading)
@@ -275,8 +342,10 @@ class View:
             self.panel.show_state()
 
     def _show(self, reading: Reading, status: str) -> None:
+        beside = None if self._beside is None else self._beside.read(self.scene)
         if reading.error is None:
-            self._stage.show(reading, self.scene.faces)
+            self._stage.show(reading, self.scene.faces, beside)
+        self.panel.show_beside(beside, None if self._beside is None else self._beside.scene)
         self.panel.show_figures(reading, reading.error or status)
 
     def _report(self, error: Exception) -> None:

@@ -19,12 +19,13 @@ _FLOOR_COLOUR, _LINE_COLOUR = (238, 235, 229), (226, 221, 213)
 # A narrow view, from as far as it takes: limbs near the camera look no larger than they are.
 _FIELD_OF_VIEW = 0.5  # radians, of the height
 
-_CLEAR, _PENETRATING, _INVERTED = (
-    f"/surface/{label}" for label in ("clear", "penetrating", "inverted")
-)
+_SURFACE, _BESIDE = "/surface", "/beside"
+_CLEAR, _PENETRATING, _INVERTED = "clear", "penetrating", "inverted"
 # Drawn first, in no color at all, it hides all but the surface's front layer: transparent
 # triangles are not sorted, and those behind would show through in patches.
-_VEIL = "/surface/veil"
+_VEIL = "veil"
+# How far apart two bodies stand, in sizes of the first.
+_APART = 0.6
 
 Turned = Callable[[int, tuple[float, ...]], None]
 
@@ -36,23 +37,29 @@ class Stage:
         self._server = server
         self._meshes: dict[str, Any] = {}
         self._handles: dict[int, Any] = {}
+        self._aside = np.zeros(3)
         self.see_through = True
 
-    def begin(self, scene: Scene, reading: Reading) -> None:
-        """Clear the stage for another scene, and look at it."""
+    def begin(self, scene: Scene, reading: Reading, *, pair: bool = False) -> None:
+        """Clear the stage for another scene, or for two side by side, and look at it."""
         api = self._server.scene
         api.reset()
         api.set_up_direction("+y")
         api.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8))
         self._meshes, self._handles = {}, {}
-        self._look_at(reading, scene.faces)
+        self._look_at(reading, scene.faces, pair)
 
-    def _look_at(self, reading: Reading, faces: Int[np.ndarray, "F 3"]) -> None:
+    def _look_at(self, reading: Reading, faces: Int[np.ndarray, "F 3"], pair: bool) -> None:
         # From where the pictures of `spt_jax.show` would look: most of the overlap is seen.
         points = reading.vertices.astype(np.float64)
         towards = frame([points], faces, [reading.labels], "auto", 1.0).axes[2]
         low, high = points.min(axis=0), points.max(axis=0)
         middle, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+        self._aside = np.zeros(3)
+        if pair:  # to the right of the first, as seen from there
+            right = np.cross([0.0, 1.0, 0.0], towards)
+            self._aside = _APART * size * right / max(float(np.linalg.norm(right)), 1e-6)
+            middle, size = middle + self._aside / 2, (1 + _APART) * size
         cell = 10.0 ** np.floor(np.log10(size)) / 4
         self._server.scene.add_grid(
             "/floor",
@@ -71,29 +78,43 @@ class Stage:
             camera.fov = _FIELD_OF_VIEW
             camera.position, camera.look_at = position, middle
 
-    def show(self, reading: Reading, faces: Int[np.ndarray, "F 3"]) -> None:
-        """Draw the surface that was measured."""
+    def show(
+        self, reading: Reading, faces: Int[np.ndarray, "F 3"], beside: Reading | None = None
+    ) -> None:
+        """Draw the surface that was measured, and the one that stands beside it, if any."""
+        with self._server.atomic():
+            self._show(reading, faces, _SURFACE, np.zeros(3))
+            if beside is not None and beside.error is None:
+                self._show(beside, faces, _BESIDE, self._aside)
+            else:
+                for name, mesh in self._meshes.items():
+                    mesh.visible = mesh.visible and not name.startswith(_BESIDE)
+            self.set_see_through(self.see_through)
+
+    def _show(self, reading: Reading, faces, root: str, offset: Float[np.ndarray, "3"]) -> None:
         marked = marked_triangles(reading.labels, faces)
         penetrating = marked & (reading.labels[faces] == PENETRATING).any(axis=1)
-        with self._server.atomic():
-            for chosen, color, names in (
-                (~marked, BODY_COLOR, (_VEIL, _CLEAR)),
-                (penetrating, PENETRATING_COLOR, (_PENETRATING,)),
-                (marked & ~penetrating, INVERTED_COLOR, (_INVERTED,)),
-            ):
-                self._draw(reading.vertices, faces[chosen], color, names)
-            self.set_see_through(self.see_through)
+        vertices = reading.vertices + offset.astype(reading.vertices.dtype)
+        for chosen, color, names in (
+            (~marked, BODY_COLOR, (_VEIL, _CLEAR)),
+            (penetrating, PENETRATING_COLOR, (_PENETRATING,)),
+            (marked & ~penetrating, INVERTED_COLOR, (_INVERTED,)),
+        ):
+            self._draw(vertices, faces[chosen], color, [f"{root}/{name}" for name in names])
 
     def set_see_through(self, wanted: bool) -> None:
         """Whether what is in another part shines through it."""
         self.see_through = wanted
-        if self._meshes:
-            # Without overlap there is nothing to see, and an opaque surface is crisper.
-            veiled = wanted and any(
-                self._meshes[name].visible for name in (_PENETRATING, _INVERTED)
+        for root in (_SURFACE, _BESIDE):
+            if f"{root}/{_CLEAR}" not in self._meshes:
+                continue
+            clear, veil, *others = (
+                self._meshes[f"{root}/{name}"] for name in (_CLEAR, _VEIL, _PENETRATING, _INVERTED)
             )
-            self._meshes[_VEIL].visible = veiled and self._meshes[_CLEAR].visible
-            self._meshes[_CLEAR].opacity = _OPACITY if veiled else None
+            # Without overlap there is nothing to see, and an opaque surface is crisper.
+            veiled = wanted and any(mesh.visible for mesh in others)
+            veil.visible = veiled and clear.visible
+            clear.opacity = _OPACITY if veiled else None
 
     def set_handles(self, scene: Scene, joints: Sequence[int], turned: Turned) -> None:
         """Rings to turn these joints by, in place of those that were there."""
@@ -147,7 +168,7 @@ class Stage:
                     points,
                     triangles,
                     color=color,
-                    opacity=0.0 if name == _VEIL else None,
+                    opacity=0.0 if name.endswith(_VEIL) else None,
                     visible=any_face,
                     cast_shadow=False,
                     receive_shadow=False,
