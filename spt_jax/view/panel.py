@@ -63,8 +63,9 @@ class Panel:
 
     def show_beside(self, reading: Reading | None, scene: Scene | None) -> None:
         """Write what was measured of what stands beside, if anything does."""
-        shown = reading is not None and scene is not None
-        content = figures(reading, scene, "", "spt-figures-beside") if shown else ""
+        content = ""
+        if reading is not None and scene is not None:
+            content = figures(reading, scene, "", "spt-figures-beside")
         if self._beside.content != content:
             self._beside.content = content
 

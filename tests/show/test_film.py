@@ -40,7 +40,7 @@ def test_an_animated_picture_plays_all_frames_side_by_side(
     write_film(path, motions, ball.faces, frames_per_second=25.0, size=_SIZE)
     sizes = []
     with Image.open(path) as picture:
-        assert picture.n_frames == 5 and picture.info.get("loop", 0) == 0
+        assert getattr(picture, "n_frames", 1) == 5 and picture.info.get("loop", 0) == 0
         for k in range(5):
             picture.seek(k)
             picture.load()
