@@ -24,22 +24,22 @@ def check(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Report on the self-intersection of a mesh file of any kind that trimesh reads.
+    """Report the self-intersections of a mesh file.
 
     The exit code is 0 if no triangles intersect and nothing overlaps, 1 if the mesh
-    self-intersects, and 2 if it cannot be judged: unreadable, open, inconsistently wound, inside
-    out or too crumpled. What is wrong is said with counts. Contact is no intersection.
+    self-intersects, and 2 if that cannot be decided because the mesh is unreadable, open,
+    inconsistently wound, inside out or too crumpled. Defects are listed with counts. Contact is
+    not an intersection.
 
     Args:
         mesh: the file, such as body.ply, body.obj, body.stl or body.glb.
-        solids: a file of closed meshes beside an open one, such as a body under a garment: how much
-            of the garment lies in them is reported, and how deep, in place of what it does to
-            itself.
+        solids: a file of closed meshes for an open one, such as a body under a garment: reports how
+            much of the garment lies inside them, and how deep, instead of self-intersections.
         rays: how many rays to cast along the longer side of each of three beams; not given: none,
             everything is measured exactly.
         max_bytes: what the file and its arrays may take; not given: 1 GiB.
         json: print the report as JSON.
-        quiet: print errors alone.
+        quiet: print only errors.
     """
     console = out_console(quiet)
     found: dict[str, Any] = {

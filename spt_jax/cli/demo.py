@@ -40,14 +40,14 @@ _GUTTER = 24  # pixels between the halves of the picture
 def demo(out: Path = Path("demo"), frames: int = 4, quiet: bool = False) -> int:
     """Untangle real motion-capture poses of the embedded body, and show them before and after.
 
-    The pose is freed of collisions, then the skin of its folds. Writes before_after.png (triangles
-    in self-intersection red), a .glb and a .ply of each frame before and after, the untangled
-    poses.npz and report.json.
+    Collisions are removed by changing the pose, then folds by moving the skin. Writes
+    before_after.png (triangles in self-intersection are red), a .glb and a .ply of each frame
+    before and after, the untangled poses.npz and report.json.
 
     Args:
         out: folder for the results, made where missing.
         frames: how many frames, 1 to 8.
-        quiet: print errors alone.
+        quiet: print only errors.
     """
     if not 1 <= frames <= len(DEMO_FRAMES):
         raise CommandError(f"frames must be from 1 to {len(DEMO_FRAMES)}: got {frames}.")

@@ -39,24 +39,23 @@ def untangle(
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Free the motions of a pose file from self-intersections, or single poses, or one mesh file.
+    """Remove the self-intersections of motions or poses in a pose file, of a rig or of a mesh file.
 
-    Frames that follow each other are a motion: it is freed as a whole and stays as smooth as it
-    was. What is done of it is kept, so that a run that was ended goes on there.
+    Consecutive frames are a motion, which is untangled as a whole and stays as smooth as it was.
+    Finished work is saved, so that the same command continues an interrupted run.
 
     Takes the pose files of AMASS, SMPLify-X, PROX, HMR2, PHALP, WHAM, VIBE, PyMAF, GVHMR, TRAM,
     ROMP, BEV, SLAHMR, BEDLAM, AIST++, 3DPW, MOYO, EasyMocap, MMHuman3D, Motion-X and VPoser, BVH,
     and files that this command wrote; their suffixes do not matter. Writes poses.npz (AMASS layout,
     in the body's joints; of several people one file each, poses_NAME.npz) and report.json. Each
-    frame that is done is kept in OUT/unfinished until all are: a run that was ended goes on with
-    the same command.
+    finished frame is kept in OUT/unfinished until all are done.
 
-    Of a rigged character (.glb, .gltf or .vrm with a skin) every animation is freed; it is written
-    back into the same file, NAME_untangled.glb, as one more animation, and as .npz and .bvh.
+    Of a rigged character (.glb, .gltf or .vrm with a skin) every animation is untangled and added
+    to a copy of the file, NAME_untangled.glb, and written as .npz and .bvh.
 
     Of a mesh (.ply, .obj, .stl, .off, .glb, ...) the vertices move, and NAME_untangled is written
     in the same format; the exit code is 1 if something still intersects or overlaps. With --fixed
-    BODY a garment, open or closed, is freed from a body that stays as it is.
+    BODY, a garment, open or closed, is moved out of a body that stays where it is.
 
     Args:
         poses: the pose file (.npz, .npy, .pkl, .pt, .json, .bvh), a rig or a mesh file.
@@ -66,34 +65,33 @@ def untangle(
             file the one character
         body: "anny", the body that comes with the package, or an SMPL, SMPL-H or SMPL-X model file
             (.npz, .pkl).
-        folds: of a posed body, what becomes of skin that folds where a joint bends: "ignore" leaves
-            it, "remove" frees the posed vertices of all that still crosses (only the meshes show
-            it, the poses do not), "count" takes folds for collisions. A line says how much is left
-            out.
-        fold_distance: how near to each other, along the skin at rest and in metres, what intersects
-            is a fold; not given: as near as the place allows, 0.3 on trunk and limbs and 0.02 to
-            0.04 on fingers.
+        folds: how folds of skin at bent joints are treated: "ignore" leaves them, "remove" moves
+            the posed vertices until nothing intersects (which only the meshes show, not the poses),
+            "count" treats them as collisions. The report says how much is excluded.
+        fold_distance: intersecting skin nearer than this, along the skin at rest and in meters, is
+            a fold; not given: a distance for each place, 0.3 on trunk and limbs and 0.02 to 0.04 on
+            fingers.
         keep_contact: parts within 20 mm of each other, such as clapping hands and crossed arms,
             stay as near as they are.
         meshes: write a .glb of each frame before and after, colored by label; of a motion one
             that plays before and after side by side.
         like_input: write NAME_untangled too, the input in its own structure with the new poses.
-        together: the people of a file as one scene: freed of themselves and of each other; what is
-            between and within them is counted apart. Frame by frame, people are moved as a whole,
-            too; in a motion they stay where they are.
-        fixed: of a mesh, another mesh file that stays where it is, such as the body under a
-            garment; the first mesh is moved out of it. An open mesh is a garment: what it does to
-            itself is not looked at.
-        frame_by_frame: free each frame by itself, as single poses are.
-        fps: frames a second; not given: those of the file, or 30.
+        together: treat the people of a file as one scene and remove overlaps within and between
+            them, which are reported separately. Frame by frame, people are also moved as a whole;
+            in a motion they stay where they are.
+        fixed: for a mesh: another mesh file that stays where it is, such as the body under a
+            garment; the first mesh is moved out of it. An open mesh is a garment, whose
+            self-intersections are not considered.
+        frame_by_frame: untangle each frame by itself, like single poses.
+        fps: frames per second; not given: those of the file, or 30.
         up: the axis that is up, by which standing feet are detected: x, y, z, -x, -y, -z; "auto":
             the one along which heads are above hips.
         rays: how many rays to cast along the longer side of each of three beams; the search uses
             half as many; not given: none, everything is measured exactly.
-        anew: throw away what is done of an unfinished run in the folder.
+        anew: discard what an unfinished run left in the folder.
         max_bytes: how large an input file may be, and its arrays once unpacked; not given: 1 GiB.
-        json: print the report as JSON in place of the table.
-        quiet: print errors alone.
+        json: print the report as JSON instead of the table.
+        quiet: print only errors.
     """
     from spt_jax.io.pose_files import is_pose_file
     from spt_jax.io.rigs.reading import is_rig_file
