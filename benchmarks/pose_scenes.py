@@ -3,17 +3,19 @@
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.oracles import RestGraph, far_crossings
 from spt_jax import BodyModel, PinholeCamera, load_body, load_mocap, self_intersection_penalty
 from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from spt_jax.fit.problem.learned_priors import pose_prior
 from spt_jax.fit.problem.priors import GaussianPosePrior
+from spt_jax.io.pose_files import load_poses
 
 JOINTS = 22
 FOCAL, CENTER = 1200.0, (500.0, 500.0)  # pixels; a person of 1.7 m is 400 to 680 pixels tall
@@ -56,16 +58,10 @@ def scenes(first: int, count: int, seed: int) -> Iterator[Scene]:
     """
     body, mocap = load_body(), load_mocap()
     order = np.random.default_rng(seed).permutation(len(mocap.names))
-    faces = np.asarray(body.faces, np.int64)
-    graph = RestGraph.of_body(body)
     found = 0
     for frame in order:
         scene = _scene(body, mocap.names[frame], mocap.pose[frame], (seed, int(frame)))
-        vertices = np.asarray(_vertices(body, scene), np.float64)
-        # The penalty is quick and sees what collides; the oracle, which is not ours, confirms.
-        if float(_overlap(jnp.asarray(vertices, jnp.float32))) > 1e-9:
-            continue
-        if far_crossings(vertices, faces, graph).num_far:
+        if not _is_free(body, scene):
             continue
         found += 1
         if found > first:
@@ -87,6 +83,40 @@ def stored_scenes(path: Path | None, first: int, count: int, seed: int) -> list[
         columns: dict[str, Any] = {n: [getattr(s, n) for s in found] for n in Scene._fields}
         np.savez(path, **columns)
     return found[first:]
+
+
+def scenes_of_file(path: Path, up: Literal["y", "z"], count: int, seed: int) -> list[Scene]:
+    """Scenes without collisions of poses in a file that `load_poses` reads, evenly over its frames.
+
+    Args:
+        path: the file.
+        up: which of its axes points up.
+        count: how many scenes at most.
+        seed: of all that is random in a scene.
+
+    Raises:
+        ValueError: the file holds no pose without collisions.
+    """
+    body = load_body()
+    frames = []
+    for track in load_poses(path):
+        poses = np.array(track.pose[:, :JOINTS], np.float32)
+        if up == "z":
+            down = Rotation.from_euler("x", -90, degrees=True)
+            turned = down * Rotation.from_rotvec(poses[:, 0])
+            poses[:, 0] = turned.as_rotvec()
+        frames += [(f"{path.stem}_{track.name}/{k:04}", pose) for k, pose in enumerate(poses)]
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(3 * count, len(frames))).astype(int))
+    found = []
+    for place in np.random.default_rng(seed).permutation(chosen).tolist():
+        scene = _scene(body, *frames[place], (seed, place))
+        if _is_free(body, scene):
+            found.append(scene)
+        if len(found) == count:
+            break
+    if not found:
+        raise ValueError(f"{path} must hold a pose without collisions: got none.")
+    return found
 
 
 def prior_without(motion: str) -> GaussianPosePrior:
@@ -116,6 +146,19 @@ def _scene(body: BodyModel, name: str, frame: np.ndarray, seed: tuple[int, int])
 
 def _vertices(body: BodyModel, scene: Scene):
     return body(scene.pose, scene.shape, scene.translation).vertices
+
+
+def _is_free(body: BodyModel, scene: Scene) -> bool:
+    vertices = np.asarray(_vertices(body, scene), np.float64)
+    # The penalty is quick and sees what collides; the oracle, which is not ours, confirms.
+    if float(_overlap(jnp.asarray(vertices, jnp.float32))) > 1e-9:
+        return False
+    return not far_crossings(vertices, np.asarray(body.faces, np.int64), _graph()).num_far
+
+
+@cache
+def _graph() -> RestGraph:
+    return RestGraph.of_body(load_body())
 
 
 @cache

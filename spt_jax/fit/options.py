@@ -147,12 +147,17 @@ class Stages(eqx.Module):
     """How the regularized stages descend; the regularizer's weights say how many there are.
 
     Attributes:
-        solver: any optimistix minimiser; a BFGS by default.
-        max_steps: of each stage.
+        solver: any optimistix minimiser. By default the self-intersection penalty has a search of
+            its own, on the host, which asks for the overlap a few times (`spt_jax/fit/contact`);
+            other regularizers, other values of the penalty and traced calls have a BFGS.
+        max_steps: of each stage; the search on the host goes on for three times as many in the last
+            one, where it has something left to gain.
+        free: whether that search goes on after the last stage until no parts intersect, with the
+            keypoints, prior and limits in its objective. Only where folds are left out.
 
     Raises:
         ValueError: max_steps is no positive whole number.
-        TypeError: a solver that is no minimiser.
+        TypeError: a solver that is no minimiser; free is neither True nor False.
 
     Example:
         >>> import optimistix as optx
@@ -165,6 +170,7 @@ class Stages(eqx.Module):
     max_steps: int = eqx.field(
         static=True, default=20, converter=partial(_as_count, "max_steps of the stages")
     )
+    free: bool = eqx.field(static=True, default=True, converter=partial(_as_flag, "free"))
 
     def __check_init__(self):
         _check_solver("solver of the stages", self.solver)

@@ -26,6 +26,7 @@ from spt_jax.fit.regularizers._base import Regularizer
 from spt_jax.fit.regularizers.spt import SelfIntersection
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.setup import Setup, prepare_fit
+from spt_jax.fit.solver import default_solver
 from spt_jax.fit.stages import descend
 from spt_jax.keypoints import AnyLayout
 from spt_jax.overlap.measure import Unmeasurable
@@ -246,7 +247,8 @@ def _descend_together(
             one.start._replace(pose=pose, shape=shape, translation=translation)
         )
     )(objectives, fits.pose, fits.shape, fits.translation)
-    end = descend(setup.regularizer, setup.body, objectives, vectors, setup.solver, setup.max_steps)
+    solver = setup.solver or default_solver()
+    end = descend(setup.regularizer, setup.body, objectives, vectors, solver, setup.max_steps)
 
     def each(objective, vector, steps):
         return fit_result(setup.body, objective, vector, {}, end.converged, steps)

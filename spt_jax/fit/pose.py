@@ -7,20 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from spt_jax._camera import PinholeCamera
 from spt_jax._report import intersection_report
 from spt_jax._steps import OnStep, Step
 from spt_jax.body import BodyModel
 from spt_jax.bridge.programs import program
+from spt_jax.fit.contact.places import Ground
+from spt_jax.fit.contact.stages import Stages as PenaltyStages
+from spt_jax.fit.contact.stages import settled
 from spt_jax.fit.options import Numbers, Search, Stages, Start, Terms
 from spt_jax.fit.problem.inputs import Keypoints, Person
 from spt_jax.fit.problem.objective import Objective
 from spt_jax.fit.regularizers._base import Regularizer
+from spt_jax.fit.regularizers.spt import SelfIntersection
 from spt_jax.fit.result import FitResult, fit_result
 from spt_jax.fit.search.candidates import Candidates
 from spt_jax.fit.setup import KeypointSearch, Setup, prepare_fit
+from spt_jax.fit.solver import default_solver
 from spt_jax.fit.stages import Descent, descend, unpacked
 from spt_jax.keypoints import AnyLayout
 from spt_jax.overlap.measure import Unmeasurable
@@ -57,9 +62,11 @@ def fit_pose(
     flips of each limb (a bone that leans towards the camera and its mirror image that leans away
     look the same); then with it, its weight rising from stage to stage, from the two best of these,
     one of them chosen with the regularizer in view. What ends with the lowest total is returned.
-    All of it is compiled. The people of a batch are solved one after another, so that
-    each ends when it is done; under `vmap` they are solved side by side. Other numbers of any kind
-    do not compile anew; other counts, options and layouts do.
+    With the self-intersection penalty the search then goes on, by more weight and with the surface
+    moved outwards, until no parts intersect (`Stages.free`); `status` says so where it does not.
+    The terms are compiled; the penalty's own stages run on the host. The people of a batch are
+    solved one after another, so that each ends when it is done; under `vmap` they are solved side
+    by side. Other numbers of any kind do not compile anew; other counts, options and layouts do.
 
     Args:
         body: any `BodyModel`.
@@ -78,12 +85,14 @@ def fit_pose(
             rivals of the paper's section 4.4; or a `Regularizer` with weights of its own.
         search: how many orientations are tried, and what minimizes the keypoints' objective.
         stages: what minimizes it with the regularizer.
-        on_step: called with a `spt_jax.Step` after the search, stage 0, and after each stage of the
-            regularizer; what it raises ends the fit. Person after person of a batch.
+        on_step: called with a `spt_jax.Step` after the search, stage 0, after each stage of the
+            regularizer, and once more where parts had to be freed after them; what it raises ends
+            the fit. Person after person of a batch.
 
     Returns:
-        FitResult with the batch axes of `keypoints`. It is never NaN for usable input: where a
-        stage fails, what was there before it stays.
+        FitResult with the batch axes of `keypoints`. Under jit and vmap the penalty has the stages
+        of other regularizers, compiled, and is not freed afterwards. It is never NaN for usable
+        input: where a stage fails, what was there before it stays.
 
     Raises:
         TypeError, ValueError: arguments of the wrong kind or shape, named in the message; on_step
@@ -132,12 +141,73 @@ def fit_each(setup: Setup, people: Person, on_step: OnStep | None = None) -> Fit
     # took 1.3 times as long as one by one. Nor in threads: two of these programs at a time make
     # XLA's CPU client wait for itself for ever (jax 0.10.2, two cores).
     count = len(people.keypoints)
+    by_cuts = _has_cuts(setup)
     rows = [jax.tree.map(lambda leaf, k=k: leaf[k], people) for k in range(count)]
-    if on_step is None:
+    if by_cuts:
+        found = [_fit_by_cuts(setup, row, on_step) for row in rows]
+    elif on_step is None:
         found = [_fit_one(setup, row) for row in rows]
     else:
         found = [_fit_in_steps(setup, row, on_step) for row in rows]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+
+
+def _has_cuts(setup: Setup) -> bool:
+    term = setup.regularizer
+    return setup.solver is None and isinstance(term, SelfIntersection) and term.is_plain
+
+
+def _fit_by_cuts(setup: Setup, person: Person, on_step: OnStep | None) -> FitResult:
+    """The stages of the self-intersection penalty, by the search on the host."""
+    term = setup.regularizer
+    assert isinstance(term, SelfIntersection)
+    candidates = _searched(setup.search, person)
+    searched = int(candidates.steps)
+    ground = Ground(setup.search, setup.body, jax.tree.map(lambda leaf: leaf[None], person), term)
+
+    def tell(stage: int, vector: Float[Array, "D"]) -> None:
+        if on_step is not None:
+            posed = _posed(setup.search, setup.body, person, vector)
+            on_step(_step(setup.body, stage, searched + ground.looks, posed))
+
+    tell(0, candidates.vectors[0])
+    stages = PenaltyStages(
+        ground,
+        np.asarray(term.weights, np.float64),
+        float(term.margin),
+        setup.max_steps,
+        lambda stage, place: tell(stage, jnp.asarray(place.vector[0], ground.dtype)),
+    )
+    end = settled(stages, candidates.vectors, free=setup.free and term.folds == "ignore")
+    vector, energy, converged, free = candidates.vectors[0], jnp.nan, False, True
+    if end is not None:
+        vector, energy = jnp.asarray(end.place.vector[0], ground.dtype), end.place.energy
+        converged, free = end.converged, end.is_free or not setup.free or term.folds == "count"
+    return _finished(
+        setup.search,
+        setup.body,
+        person,
+        vector,
+        {term.name: jnp.asarray(stages.last * energy, ground.dtype)},
+        jnp.asarray(converged),
+        jnp.asarray(searched + ground.looks),
+        jnp.asarray(free),
+    )
+
+
+@program
+def _finished(
+    search: KeypointSearch,
+    body: BodyModel,
+    person: Person,
+    vector: Float[Array, "D"],
+    regularized: dict[str, Float[Array, ""]],
+    converged: Bool[Array, ""],
+    steps: Int[Array, ""],
+    free: Bool[Array, ""],
+) -> FitResult:
+    objective = search.objective(person)
+    return fit_result(body, objective, vector, regularized, converged, steps, free)
 
 
 def _fit_one(setup: Setup, person: Person) -> FitResult:
@@ -150,7 +220,7 @@ def _fit_in_steps(setup: Setup, person: Person, on_step: OnStep) -> FitResult:
     candidates = _searched(setup.search, person)
     tracks = _tracks(setup, person, candidates)
     taken = int(candidates.steps)
-    on_step(_step(setup, 0, taken, _posed(setup, person, tracks[0])))
+    on_step(_step(setup.body, 0, taken, _posed(setup.search, setup.body, person, tracks[0])))
     ends = None
     for number, weight in enumerate(setup.regularizer.weights):
         now = dataclasses.replace(
@@ -158,7 +228,8 @@ def _fit_in_steps(setup: Setup, person: Person, on_step: OnStep) -> FitResult:
         )
         ends, best = _one_stage(now, person, tracks)
         tracks, taken = ends.vectors[:, 0], taken + int(jnp.sum(ends.steps))
-        on_step(_step(setup, number + 1, taken, _posed(setup, person, tracks[best])))
+        posed = _posed(setup.search, setup.body, person, tracks[best])
+        on_step(_step(setup.body, number + 1, taken, posed))
     assert ends is not None  # a regularizer has a weight at least
     return _chosen(setup, person, ends, jnp.asarray(taken))
 
@@ -202,7 +273,12 @@ def _descended(setup: Setup, person: Person, tracks: Float[Array, "2 D"]) -> Des
 
     def through_stages(vector):
         return descend(
-            setup.regularizer, setup.body, alone, vector[None], setup.solver, setup.max_steps
+            setup.regularizer,
+            setup.body,
+            alone,
+            vector[None],
+            setup.solver or default_solver(),
+            setup.max_steps,
         )
 
     return jax.vmap(through_stages)(tracks)
@@ -232,15 +308,15 @@ def _one_stage(
 
 @program
 def _posed(
-    setup: Setup, person: Person, vector: Float[Array, "D"]
+    search: KeypointSearch, body: BodyModel, person: Person, vector: Float[Array, "D"]
 ) -> tuple[Float[Array, "J 3"], Float[Array, "V 3"]]:
-    found = setup.search.objective(person).unpack(vector)
-    return found.pose, setup.body(found.pose, found.shape, found.translation).vertices
+    found = search.objective(person).unpack(vector)
+    return found.pose, body(found.pose, found.shape, found.translation).vertices
 
 
-def _step(setup: Setup, stage: int, taken: int, posed: tuple[Array, Array]) -> Step:
+def _step(body: BodyModel, stage: int, taken: int, posed: tuple[Array, Array]) -> Step:
     pose, vertices = (np.asarray(one) for one in posed)
-    return Step(stage, taken, vertices, pose, partial(_volume_and_pairs, setup.body, vertices))
+    return Step(stage, taken, vertices, pose, partial(_volume_and_pairs, body, vertices))
 
 
 def _volume_and_pairs(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> tuple[float, int]:

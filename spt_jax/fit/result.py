@@ -13,7 +13,8 @@ from spt_jax.fit.problem.objective import Objective
 
 _WORDS = {
     "successful": "converged",
-    "nonlinear_max_steps_reached": "stopped at the largest number of steps",
+    "nonlinear_max_steps_reached": "stopped at the largest number of steps, still gaining: "
+    "Stages(max_steps=) allows more",
 }
 
 
@@ -45,7 +46,7 @@ class FitResult(Result):
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the last stage ended at a minimum that a photograph could show."""
+        """Whether the last stage ended at a minimum that a photograph could show, free if asked."""
         return self.status == RESULTS.successful
 
     @property
@@ -70,6 +71,7 @@ def fit_result(
     regularized: dict[str, Float[Array, ""]],
     converged: Bool[Array, ""],
     steps: Int[Array, ""],
+    free: Bool[Array, ""] | bool = True,
 ) -> FitResult:
     """The result of one person's fit that ended at a vector.
 
@@ -80,6 +82,7 @@ def fit_result(
         regularized: what the regularizer costs, by its name; empty for none.
         converged: whether the last stage ended at a minimum.
         steps: of the solvers.
+        free: whether no parts intersect, where the fit was to end so.
     """
     found = objective.unpack(vector)
     posed = body(found.pose, found.shape, found.translation)
@@ -91,6 +94,7 @@ def fit_result(
     outside = photograph.outside_photographs(objective, vector, posed.vertices)
     ended: Any = RESULTS.successful, RESULTS.nonlinear_max_steps_reached
     status: Any = RESULTS.where(converged, *ended)
+    status = RESULTS.where(free, status, RESULTS.intersections_left)
     for code, one in photograph.STATUSES.items():
         status = RESULTS.where(outside == code, one, status)
     status = RESULTS.where(finite, status, RESULTS.not_finite)

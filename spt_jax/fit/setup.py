@@ -76,13 +76,23 @@ class KeypointSearch(eqx.Module):
 
 
 class Setup(eqx.Module):
-    """What a whole fit has to know: the search, and the stages that come after it."""
+    """What a whole fit has to know: the search, and the stages that come after it.
+
+    Attributes:
+        search: the fit to the keypoints alone.
+        body: the model.
+        regularizer: prepared for the body.
+        solver: what the stages minimize with; None for what suits the regularizer.
+        max_steps: of each stage.
+        free: whether the search goes on until nothing intersects.
+    """
 
     search: KeypointSearch
     body: BodyModel
     regularizer: Regularizer
-    solver: optx.AbstractMinimiser
+    solver: optx.AbstractMinimiser | None
     max_steps: int = eqx.field(static=True)
+    free: bool = eqx.field(static=True)
 
 
 def prepare_fit(
@@ -150,8 +160,9 @@ def prepare_fit(
         search=alone,
         body=body,
         regularizer=as_regularizer(regularizer).prepared(body, in_scene),
-        solver=stages.solver or default_solver(),
+        solver=stages.solver,
         max_steps=int(stages.max_steps),
+        free=bool(stages.free),
     )
     # A search starts from the middle of what is likely: a T-pose is far from any that people take.
     middle = (likely or pose_prior(body.joint_names)).middle()

@@ -22,14 +22,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from spt_jax._nonnegative import nonnegative_minimum
+
 # Cuts of one frame that are kept, the latest ones.
 _CUTS = 5
 
 # Of the dual's diagonal, added so that equal cuts can be solved for.
 _RIDGE = 1e-9
-
-# Rounds of pivoting in blocks; and how many without progress before it goes one by one, which ends.
-_ROUNDS, _PATIENCE = 300, 5
 
 
 class Prior(NamedTuple):
@@ -214,42 +213,3 @@ def _with_free(matrix, wanted, count: int, positive):
     left = wanted[cut] - matrix[cut, free] @ solved[:, -1]
     weight = nonnegative_minimum((rest + rest.T) / 2, left, positive)
     return np.concatenate([weight, solved[:, -1] - solved[:, :-1] @ weight])
-
-
-def nonnegative_minimum(
-    matrix: Float[np.ndarray, "C C"],
-    wanted: Float[np.ndarray, "C"],
-    positive: Bool[np.ndarray, "C"],
-) -> Float[np.ndarray, "C"]:
-    """a >= 0 at which a' M a / 2 - a . wanted is least, M positive definite.
-
-    By pivoting in blocks (Júdice and Pires 1994): those that are held at zero and those that are
-    not change sides all at once while that leaves fewer and fewer on the wrong one, and otherwise
-    only the last of them, which comes to an end.
-
-    Args:
-        matrix: M.
-        wanted: what M a would be, were all positive.
-        positive: a first guess of where a is.
-    """
-    positive = positive.copy()
-    fewest, patience = len(wanted) + 1, _PATIENCE
-    size = np.abs(wanted).max(initial=0.0)
-    found = np.zeros_like(wanted)
-    for _ in range(_ROUNDS):
-        at = np.flatnonzero(positive)
-        found = np.zeros_like(wanted)
-        if len(at):
-            found[at] = np.linalg.solve(matrix[np.ix_(at, at)], wanted[at])
-        left = wanted - matrix @ found
-        wrong = np.flatnonzero(np.where(positive, found < 0, left > 1e-9 * size))
-        if not len(wrong):
-            break
-        if len(wrong) < fewest:
-            fewest, patience = len(wrong), _PATIENCE
-        elif patience:
-            patience -= 1
-        else:
-            wrong = wrong[-1:]
-        positive[wrong] = ~positive[wrong]
-    return np.maximum(found, 0.0)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
-from spt_jax.untangle.frame_cuts import FrameCuts, Ties, nonnegative_minimum, prior
+from spt_jax._nonnegative import nonnegative_minimum
+from spt_jax.untangle.frame_cuts import FrameCuts, Ties, prior
 
 
 def cost(prior_matrix, cuts, stiffness, mean, ties):

@@ -7,6 +7,7 @@ from helpers import embedded_body
 from helpers_collisions import body_exclusions, posed_by, with_joints
 
 from spt_jax import untangle_pose
+from spt_jax.body import swings
 from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.untangle import sides
 
@@ -23,7 +24,7 @@ THROUGH = with_joints({"left_shoulder": (0.0, 0.0, -1.9)})  # down through the h
 
 def test_the_limb_that_collides_is_found():
     body = embedded_body()
-    limbs = sides.limbs_in_collision(look(THROUGH), body.part_groups, body.parents)
+    limbs = swings.limbs_in_collision(look(THROUGH), body.part_groups, body.parents)
     assert body.joint_names[limbs[0]] in ("left_collar", "left_shoulder")
 
 
@@ -35,7 +36,7 @@ def test_places_on_other_sides_are_free_and_the_nearest_come_first():
         return not found.intersecting_pairs, found.vertices
 
     pose = np.asarray(THROUGH, np.float64)
-    starts = sides.free_starts(pose, [body.joint_names.index("left_shoulder")], free, 3)
+    starts = swings.free_starts(pose, [body.joint_names.index("left_shoulder")], free, 3)
     assert starts and [s.moved for s in starts] == sorted(s.moved for s in starts)
     for start in starts:
         assert free(start.pose)[0]

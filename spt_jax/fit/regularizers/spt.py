@@ -76,6 +76,11 @@ class SelfIntersection(Regularizer):
         as_choice("gradient", self.gradient, Literal["boundary", "vertex", "unit"])
         as_choice("rule", self.rule, Literal["vertex", "triangle"])
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is the volume with its own gradient, whose root is known by planes."""
+        return (self.value, self.gradient, self.rule) == ("volume", "boundary", "vertex")
+
     def prepared(self, body: BodyModel, people: int) -> "SelfIntersection":
         """With the rest surface that decides what is a fold."""
         if self.folds == "count":
