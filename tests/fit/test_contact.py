@@ -10,16 +10,11 @@ from helpers import embedded_body
 from helpers_fit import camera, frames, seen
 from scipy.optimize import minimize
 
-from spt_jax import RESULTS, fit_pose, intersection_report
-from spt_jax.fit import Search, SelfIntersection, Stages, Start, Terms
-from spt_jax.fit.contact import stages as stages_of_contact
+from spt_jax.fit import Search, Stages, Start, Terms
 from spt_jax.fit.contact.cuts import Cuts, Squares
 from spt_jax.fit.contact.descent import descend
 from spt_jax.fit.contact.places import Place, _pulled_back, _seen
 from spt_jax.fit.setup import prepare_fit
-
-# Two frames whose bodies, and so whose keypoints, collide.
-COLLIDING = ("punch/0017", "punch/0012")
 
 
 def squares_of(rng, people=2, size=3):
@@ -97,49 +92,9 @@ def test_a_descent_ends_where_squares_and_overlap_balance(weight):
     assert place.total(weight) <= least + 0.03 * (1 + least)
 
 
-@pytest.fixture(scope="module")
-def points():
-    return np.asarray(seen(frames(*COLLIDING)))
-
-
-def pairs(found):
-    body = embedded_body()
-    return [
-        int(intersection_report(one, body.faces, rest_surface=body.rest_surface).intersecting_pairs)
-        for one in np.asarray(found.vertices)
-    ]
-
-
-def test_fits_end_free_though_the_keypoints_collide(points, monkeypatch):
-    found = fit_pose(embedded_body(), points, camera(), layout="smpl")
-    assert pairs(found) == [0, 0] and bool(found.converged.all())
-    off = np.linalg.norm(np.asarray(found.keypoints) - points, axis=-1)
-    assert off.mean() < 3  # pixels, of people of 430
-    np.testing.assert_allclose(
-        found.terms["total"],
-        sum(cost for name, cost in found.terms.items() if name != "total"),
-        rtol=1e-5,
-    )
-    # Too weak a penalty, and no search after it: what intersects stays, and is said.
-    weak = SelfIntersection((1e-4,))
-    left = fit_pose(
-        embedded_body(),
-        points,
-        camera(),
-        layout="smpl",
-        regularizer=weak,
-        stages=Stages(free=False),
-    )
-    assert all(pairs(left)) and bool(left.converged.all())
-    monkeypatch.setattr(stages_of_contact, "_ATTEMPTS", ())
-    monkeypatch.setattr(stages_of_contact, "_SWINGS", 0)
-    stuck = fit_pose(embedded_body(), points, camera(), layout="smpl", regularizer=weak)
-    assert all(pairs(stuck)) and bool(jnp.all(stuck.status == RESULTS.intersections_left))
-    assert "left" in stuck.reason[0]
-
-
-def test_programs_of_the_search_call_nothing_on_the_host(points):
+def test_programs_of_the_search_call_nothing_on_the_host():
     """Such programs are not kept by JAX from process to process."""
+    points = np.asarray(seen(frames("walk/0010")))
     setup, people, _ = prepare_fit(
         embedded_body(), points, camera(), layout="smpl", confidence=None, start=Start(),
         terms=Terms(), regularizer="spt", search=Search(), stages=Stages(),

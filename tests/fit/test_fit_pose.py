@@ -27,6 +27,7 @@ from spt_jax.fit import (
     Variables,
     as_regularizer,
 )
+from spt_jax.fit.contact import stages as contact_stages
 from spt_jax.fit.setup import prepare_fit
 from spt_jax.fit.stages import descend, total_cost
 from spt_jax.keypoints import Person
@@ -304,6 +305,53 @@ def test_each_regularizer_descends_with_another_solver(name, solver):
         assert first > 1 and after.energy < 0.5 * first
     else:
         assert first > 0.5 and after.energy < first
+
+
+def test_fits_end_free_though_the_keypoints_collide(plain, monkeypatch):
+    del plain  # whose search is compiled by now
+    body, points = embedded_body(), np.asarray(seen(frames(*COLLIDING)))
+
+    def go(**options):
+        found = fit_pose(body, points, camera(), layout="smpl", **options)
+        reports = [
+            intersection_report(one, body.faces, rest_surface=body.rest_surface)
+            for one in np.asarray(found.vertices)
+        ]
+        return found, [int(report.intersecting_pairs) for report in reports]
+
+    found, pairs = go()
+    assert pairs == [0, 0] and bool(found.converged.all())
+    off = np.linalg.norm(np.asarray(found.keypoints) - points, axis=-1)
+    assert off.mean() < 3  # pixels, of people of 430
+    # Too weak a penalty, and no search after it: what intersects stays, and is said if asked for.
+    weak = SelfIntersection((1e-4,))
+    left, pairs = go(regularizer=weak, stages=Stages(free=False))
+    assert all(pairs) and bool(left.converged.all())
+    monkeypatch.setattr(contact_stages, "_freed", lambda stages, ends, others: ends[0])
+    stuck, pairs = go(regularizer=weak)
+    assert all(pairs) and names_of(stuck.status) == ["intersections_left"] * 2
+    assert not stuck.converged.any() and "Intersections are left" in stuck.reason[0]
+
+
+@pytest.mark.slow
+def test_limbs_are_swung_to_other_sides_where_nothing_else_helps(plain, monkeypatch):
+    del plain
+    body, point = embedded_body(), np.asarray(seen(frames(COLLIDING[0])))[0]
+    begun = []
+
+    def undescended(stages, places):
+        begun.extend(stages.tried(place, converged=True) for place in places)
+        return begun
+
+    def from_other_sides(stages, ends, others):
+        return stages.from_other_sides(ends[0])
+
+    monkeypatch.setattr(contact_stages.Stages, "through", undescended)
+    monkeypatch.setattr(contact_stages, "_freed", from_other_sides)
+    found = fit_pose(body, point, camera(), layout="smpl")
+    assert begun[0].pairs > 0 and names_of(found.status) == "successful"
+    off = np.linalg.norm(np.asarray(found.keypoints) - point, axis=-1)
+    assert off.mean() < 10
 
 
 @pytest.mark.slow
