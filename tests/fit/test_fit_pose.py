@@ -204,8 +204,8 @@ def test_the_penalty_frees_bodies_that_collide():
     found = fit_pose(embedded_body(), people, camera())
     before, after = overlap(fit(keypoints)), overlap(found)
     assert min(before) > 1  # cm^3
-    assert max(after) < 0.2
-    assert (found.terms["spt"] < 1).all()
+    assert max(after) == 0 and found.reason == ["converged"] * 2
+    np.testing.assert_array_equal(found.terms["spt"], 0)
     np.testing.assert_allclose(
         found.terms["total"], sum(v for k, v in found.terms.items() if k != "total"), rtol=1e-5
     )
@@ -307,7 +307,7 @@ def test_each_regularizer_descends_with_another_solver(name, solver):
         assert first > 0.5 and after.energy < first
 
 
-def test_fits_end_free_though_the_keypoints_collide(plain, monkeypatch):
+def test_what_still_intersects_is_said(plain, monkeypatch):
     del plain  # whose search is compiled by now
     body, points = embedded_body(), np.asarray(seen(frames(*COLLIDING)))
 
@@ -319,10 +319,6 @@ def test_fits_end_free_though_the_keypoints_collide(plain, monkeypatch):
         ]
         return found, [int(report.intersecting_pairs) for report in reports]
 
-    found, pairs = go()
-    assert pairs == [0, 0] and bool(found.converged.all())
-    off = np.linalg.norm(np.asarray(found.keypoints) - points, axis=-1)
-    assert off.mean() < 3  # pixels, of people of 430
     # Too weak a penalty, and no search after it: what intersects stays, and is said if asked for.
     weak = SelfIntersection((1e-4,))
     left, pairs = go(regularizer=weak, stages=Stages(free=False))

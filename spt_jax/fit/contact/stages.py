@@ -125,10 +125,8 @@ class Stages:
             totals = [one.place.total(weight) for one in ends]
             least = min(totals)
             self.on_stage(number + 1, ends[totals.index(least)].place)
-            near = [total <= _HOPELESS * least + 1 for total in totals]
-            ends, cuts = (
-                [one for one, kept in zip(ones, near, strict=True) if kept] for ones in (ends, cuts)
-            )
+            kept = [k for k, total in enumerate(totals) if total <= _HOPELESS * least + 1]
+            ends, cuts = [ends[k] for k in kept], [cuts[k] for k in kept]
         ends.sort(key=lambda one: one.place.total(self.last))
         return [self.tried(one.place, converged=one.converged) for one in ends]
 
