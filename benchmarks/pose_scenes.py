@@ -109,7 +109,8 @@ def scenes_of_file(path: Path, up: Literal["y", "z"], count: int, seed: int) -> 
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(3 * count, len(frames))).astype(int))
     found = []
     for place in np.random.default_rng(seed).permutation(chosen).tolist():
-        scene = _scene(body, *frames[place], (seed, place))
+        name, pose = frames[place]
+        scene = _scene(body, name, pose, (seed, place))
         if _is_free(body, scene):
             found.append(scene)
         if len(found) == count:

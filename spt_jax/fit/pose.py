@@ -163,7 +163,7 @@ def _fit_by_cuts(setup: Setup, person: Person, on_step: OnStep | None) -> FitRes
     assert isinstance(term, SelfIntersection)
     candidates = _searched(setup.search, person)
     searched = int(candidates.steps)
-    ground = Ground(setup.search, setup.body, jax.tree.map(lambda leaf: leaf[None], person), term)
+    ground = Ground(setup.body, [objective_of(setup.search, person)], term)
 
     def tell(stage: int, vector: Float[Array, "D"]) -> None:
         if on_step is not None:
@@ -193,6 +193,12 @@ def _fit_by_cuts(setup: Setup, person: Person, on_step: OnStep | None) -> FitRes
         jnp.asarray(searched + ground.looks),
         jnp.asarray(free),
     )
+
+
+@program
+def objective_of(search: KeypointSearch, person: Person) -> Objective:
+    """The squares of one person's fit."""
+    return search.objective(person)
 
 
 @program

@@ -103,6 +103,6 @@ def test_programs_of_the_search_call_nothing_on_the_host():
     size = 3 * len(setup.search.figure.moving) + 3
     forces = jnp.zeros((embedded_body().num_vertices, 3))
     for function, more in ((_seen, ()), (_pulled_back, (forces,))):
-        fixed = partial(function, setup.search, setup.body, person)
+        fixed = partial(function, setup.body, setup.search.objective(person))
         traced = jax.make_jaxpr(fixed)(jnp.zeros(size), *more)
         assert "host_call" not in str(traced) and "callback" not in str(traced)

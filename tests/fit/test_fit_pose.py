@@ -376,8 +376,8 @@ def test_each_stage_is_told_and_the_result_is_the_same():
         fit_pose(body, points, camera(), layout="smpl", on_step=on_step)
         for on_step in (None, steps.append)
     )
-    # The last one is the search that goes on until nothing intersects.
-    assert [step.stage for step in steps] == [0, 1, 2, 3, 4]
+    # And once more where parts had to be freed after the last weight.
+    assert [step.stage for step in steps] in ([0, 1, 2, 3], [0, 1, 2, 3, 4])
     taken = [step.steps for step in steps]
     assert taken == sorted(taken) and taken[-1] == int(told.steps)
     assert steps[0].volume > 1e-6 and steps[0].intersecting_pairs > 0

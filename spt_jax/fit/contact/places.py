@@ -14,9 +14,8 @@ from jaxtyping import Array, Float
 from spt_jax.body import BodyModel
 from spt_jax.bridge.programs import program
 from spt_jax.fit.contact.cuts import Squares
-from spt_jax.fit.problem.inputs import Person
+from spt_jax.fit.problem.objective import Objective
 from spt_jax.fit.regularizers.spt import SelfIntersection
-from spt_jax.fit.setup import KeypointSearch
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.overlap.host_functions import PenaltyOptions, measured
 from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
@@ -52,19 +51,15 @@ class Ground:
     """Where a search for N people goes on.
 
     Args:
-        search: what a fit to the keypoints has to know.
         body: the model.
-        people: those of one scene, with a leading axis.
+        people: the objectives of those in one scene.
         term: the penalty, prepared for the body and N people.
     """
 
-    def __init__(
-        self, search: KeypointSearch, body: BodyModel, people: Person, term: SelfIntersection
-    ):
-        count = len(people.keypoints)
-        self.search, self.body, self.term = search, body, term
-        self.people = [jax.tree.map(lambda leaf, k=k: leaf[k], people) for k in range(count)]
-        self.dtype = people.keypoints.dtype
+    def __init__(self, body: BodyModel, people: list[Objective], term: SelfIntersection):
+        count = len(people)
+        self.body, self.people, self.term = body, people, term
+        self.dtype = people[0].keypoints.dtype
         faces = np.asarray(body.faces, np.int64)
         self.faces = np.concatenate([faces + k * body.num_vertices for k in range(count)])
         self._options = PenaltyOptions(
@@ -86,7 +81,7 @@ class Ground:
         """
         self.looks += 1
         rows = [jnp.asarray(row, self.dtype) for row in vector]
-        seen = [_seen(self.search, self.body, *one) for one in zip(self.people, rows, strict=True)]
+        seen = [_seen(self.body, *one) for one in zip(self.people, rows, strict=True)]
         vertices, residuals, jacobians = (
             np.stack([np.asarray(one[k], np.float64) for one in seen]) for k in range(3)
         )
@@ -110,7 +105,7 @@ class Ground:
     def _pulled(self, rows: list[Array], forces: Float[np.ndarray, "V 3"]):
         each = forces.reshape(len(rows), -1, 3)
         found = [
-            _pulled_back(self.search, self.body, person, row, jnp.asarray(force, self.dtype))
+            _pulled_back(self.body, person, row, jnp.asarray(force, self.dtype))
             for person, row, force in zip(self.people, rows, each, strict=True)
         ]
         return np.stack([np.asarray(one, np.float64) for one in found])
@@ -118,9 +113,7 @@ class Ground:
     def vertices(self, vector: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "V 3"]:
         """The surface of all people, in metres."""
         rows = [jnp.asarray(row, self.dtype) for row in vector]
-        seen = [
-            _seen(self.search, self.body, *one)[0] for one in zip(self.people, rows, strict=True)
-        ]
+        seen = [_seen(self.body, *one)[0] for one in zip(self.people, rows, strict=True)]
         return np.concatenate([np.asarray(one, np.float64) for one in seen])
 
     def measure(self, vertices: Float[np.ndarray, "V 3"]) -> Measurement | None:
@@ -136,16 +129,15 @@ class Ground:
 
 @program
 def _seen(
-    search: KeypointSearch, body: BodyModel, person: Person, vector: Float[Array, "D"]
+    body: BodyModel, objective: Objective, vector: Float[Array, "D"]
 ) -> tuple[Float[Array, "V 3"], Float[Array, "R"], Float[Array, "R D"]]:
     """Vertices, residuals and their derivatives."""
-    objective = search.objective(person)
 
     def residuals(x):
         return jnp.concatenate([part.reshape(-1) for part in objective.residuals(x).values()])
 
     return (
-        _vertices(search, body, person, vector),
+        _vertices(body, objective, vector),
         residuals(vector),
         jax.jacfwd(residuals)(vector),
     )
@@ -153,17 +145,16 @@ def _seen(
 
 @program
 def _pulled_back(
-    search: KeypointSearch,
     body: BodyModel,
-    person: Person,
+    objective: Objective,
     vector: Float[Array, "D"],
     forces: Float[Array, "V 3"],
 ) -> Float[Array, "D"]:
     """Forces on vertices as forces on the variables."""
-    (back,) = jax.vjp(lambda x: _vertices(search, body, person, x), vector)[1](forces)
+    (back,) = jax.vjp(lambda x: _vertices(body, objective, x), vector)[1](forces)
     return back
 
 
-def _vertices(search: KeypointSearch, body: BodyModel, person: Person, vector):
-    found = search.objective(person).unpack(vector)
+def _vertices(body: BodyModel, objective: Objective, vector):
+    found = objective.unpack(vector)
     return body(found.pose, found.shape, found.translation).vertices

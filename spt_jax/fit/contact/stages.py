@@ -174,7 +174,7 @@ class Stages:
 
     def _swung(self, place: Place, found: Measurement) -> Iterator[Float[np.ndarray, "1 D"]]:
         ground, body = self.ground, self.ground.body
-        objective = ground.search.objective(ground.people[0])
+        objective = ground.people[0]
         now = objective.unpack(jnp.asarray(place.vector[0], ground.dtype))
         given = np.array(now.pose, np.float64)
 
