@@ -19,8 +19,18 @@ DOCS = TOP / "docs"
 PAGES = {str(page.relative_to(DOCS)): page.read_text("utf-8") for page in DOCS.rglob("*.md")}
 #: Those whose programs take less than five seconds of a core.
 QUICK = {"contributing.md", "recipes/pose-files.md", "recipes/smplx.md", "recipes/body-models.md"}
+#: What they show is tested elsewhere, and they untangle bodies for many seconds: every night.
+NIGHTLY = {"recipes/contact.md", "recipes/through.md"}
+
+
+def _marks(name):
+    if name in NIGHTLY:
+        return pytest.mark.long
+    return () if name in QUICK else pytest.mark.slow
+
+
 SHOWN = [
-    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    pytest.param(name, marks=_marks(name))
     for name, text in sorted(PAGES.items())
     if python_blocks(text)
 ]
@@ -71,6 +81,29 @@ def newton_finds_the_balance(printed):
     assert numbers(r"differences by ([\d.]+)", printed)[0] < 0.02
 
 
+def contact_is_kept(printed):
+    assert printed.count("between them to 0.05") == 2
+    let_go, kept = numbers(r"collision-free, (\d+) mm apart", printed)
+    assert let_go > 50 and kept < 5
+
+
+def the_arm_is_out(printed):
+    before, after = numbers(r"(\d+) (?:cm\^3 before|after)", printed)
+    assert before > 500 and after == 0 and "collision-free" in printed
+
+
+def the_robot_is_free(printed):
+    before, after = map(float, re.search(r"(\d+) cm\^3, then ([\d.]+)", printed).groups())
+    assert before > 1000 and after < 0.01 * before
+    assert numbers(r"(\d+) cm\^3 of the leg", printed)[0] > 500
+
+
+def the_device_samples(printed):
+    exact, host, device = numbers(r"(0\.\d+)", printed)
+    assert 0 < abs(host / exact - 1) < 0.05 and abs(device / host - 1) < 1e-3
+    assert "returns to the host: False" in printed
+
+
 def energy_is_conserved(printed):
     (accepted,) = numbers(r"(\d+)% accepted", printed)
     (error,) = numbers(r"energy off by ([\d.]+)", printed)
@@ -111,6 +144,10 @@ EXPECTED = {
     "recipes/generator.md": the_worst_sample_is_corrected,
     "recipes/hmc.md": energy_is_conserved,
     "recipes/second-order.md": newton_finds_the_balance,
+    "recipes/contact.md": contact_is_kept,
+    "recipes/through.md": the_arm_is_out,
+    "recipes/robots.md": the_robot_is_free,
+    "recipes/accelerator.md": the_device_samples,
 }
 
 

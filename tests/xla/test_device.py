@@ -100,3 +100,17 @@ def test_the_device_path_has_to_be_asked_for(platform, monkeypatch):
     assert as_backend("auto") is None
     assert as_backend("numpy") is None and as_backend("xla") == Xla()
     assert as_backend(Xla(sorted=100)) == Xla(sorted=100)
+
+
+def test_the_program_never_returns_to_the_host():
+    vertices, faces = padded("apart", jnp.dtype("float32"))
+
+    def goes_to_the_host(backend):
+        def loss(vertices):
+            return self_intersection_penalty(vertices, faces, rays=RAYS, backend=backend)
+
+        text = jax.jit(jax.value_and_grad(loss)).lower(vertices).as_text()
+        return [word for word in ("callback", "infeed", "outfeed", "send", "recv") if word in text]
+
+    assert goes_to_the_host("xla") == []
+    assert goes_to_the_host("numpy") == ["callback"]
