@@ -98,7 +98,11 @@ def only_folds(
     found = [within_clusters(layout, slots, a) for a in own if len(a)]
     found.append(across_groups(layout, slots, clusters, far, wanted))
     for t, u in parts_of_size(pair for some in found for pair in some):
-        f, g = _intersecting(predicates, mesh.topology, layout, t, u)
+        t, u = straddling(predicates, layout, t, u)
+        f, g = (manifold.beside[layout.face[x]] for x in (t, u))
+        # Of those that are left few intersect, and only of these it is asked exactly.
+        left = np.flatnonzero(~known.clusters.near_faces(f, g))
+        f, g = _intersecting(predicates, mesh.topology, layout, t[left], u[left])
         if _count(exclusions, manifold, rules, f, g).any():
             return False
     once = np.ones(manifold.num_parts, np.int64)
@@ -119,14 +123,26 @@ def _at_rest(mesh: Prepared, layout: Layout, manifold: Manifold, rest, surely: b
         if rest.has_faces(manifold.given):
             by_cluster = manifold.beside[layout.face].reshape(-1, CLUSTER)
             sets = rest.near_sets(by_cluster, filled.reshape(-1, CLUSTER))
-        groups = None if sets is None else sets.joined(CLUSTER)
+        groups = None if sets is None else sets.joined(CLUSTER).tabulated()
         known = mesh.at_rest = AtRest(layout, rest, True, sets, groups)
     return known if known.clusters is not None else None
 
 
+def _count(
+    exclusions: Exclusions, manifold: Manifold, rules, f: Int[np.ndarray, "N"], g
+) -> Bool[np.ndarray, "N"]:
+    """Which pairs of faces that intersect count, wholly or by their contour."""
+    first, second = (manifold.part[manifold.faces[x, 0]] for x in (f, g))
+    whole, judged = rules(first, second).T
+    at = np.flatnonzero(judged)
+    counts = whole.copy()
+    beside = manifold.beside
+    counts[at] |= pair_weights(exclusions, beside[f[at]], beside[g[at]]) > 0
+    return counts
+
+
 def _intersecting(predicates: Predicates, topology: Topology, layout: Layout, t, u):
     """Faces that intersect, of pairs of slots that share no vertex."""
-    t, u = straddling(predicates, layout, t, u)
     # Every edge of either against the other, whichever triangle it belongs to first.
     row = topology.row.reshape(-1, 3).take(layout.face[np.concatenate([t, u])], axis=0).ravel()
     slot = np.repeat(np.concatenate([u, t]), 3)
@@ -135,16 +151,3 @@ def _intersecting(predicates: Predicates, topology: Topology, layout: Layout, t,
     both = np.flatnonzero(second >= 0)
     face = layout.face[slot]
     return np.concatenate([first, second[both]]), np.concatenate([face, face[both]])
-
-
-def _count(
-    exclusions: Exclusions, manifold: Manifold, rules, f: Int[np.ndarray, "N"], g
-) -> Bool[np.ndarray, "N"]:
-    """Which of some faces that intersect count, wholly or by their contour."""
-    part = manifold.part[manifold.faces[:, 0]]
-    whole, judged = rules(part[f], part[g]).T
-    at = np.flatnonzero(judged)
-    counts = whole.copy()
-    beside = manifold.beside
-    counts[at] |= pair_weights(exclusions, beside[f[at]], beside[g[at]]) > 0
-    return counts

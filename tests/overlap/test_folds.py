@@ -66,6 +66,12 @@ def test_sets_that_are_told_to_be_near_are_near():
     for one, other in zip(a[near][::7], b[near][::7], strict=True):
         f, g = (x.ravel() for x in np.meshgrid(sets[one], sets[other]))
         assert rest.near(f, g, exact=True).all()
+    f, g = np.random.default_rng(1).integers(0, 2 * size, (2, 4000))
+    g[:2000] = (f[:2000] + g[:2000] % 100) % (2 * size)
+    alone = found.near_faces(f, g)
+    assert 0.01 < alone.mean() < 0.9
+    assert rest.near(f[alone], g[alone], exact=True).all()
+    assert np.array_equal(found.tabulated().near(a, b), near)
     fours = near.reshape(15, 4, 15, 4).all(axis=(1, 3))
     a, b = (x.ravel() for x in np.indices((15, 15)))
     assert (fours.ravel() | ~found.joined(4).near(a, b)).all()

@@ -269,7 +269,8 @@ def across_groups(
     wanted: Callable[[np.ndarray, np.ndarray], Bool[np.ndarray, "N"]] | None = None,
 ):
     """Such pairs of different clusters, of pairs of groups; of clusters that are wanted."""
-    short = _short_words(shape, clusters)
+    # Where few are wanted, to make short words takes longer than they save.
+    short = _short_words(shape, clusters) if wanted is None else None
     for a, b in groups:
         for c, d, row in _meeting_members(layout, clusters, a, b):
             if wanted is not None:
@@ -325,12 +326,18 @@ def _meeting_members(layout: Layout, clusters: Boxes, a, b):
             yield first, CLUSTER * q.take(at) + place, layout.sharing.row.take(of_group)
 
 
-def _meeting_triangles(layout: Layout, shape: Slots, boxes: Boxes, short: _Short, a, b, row):
+def _meeting_triangles(
+    layout: Layout, shape: Slots, boxes: Boxes, short: "_Short | None", a, b, row
+):
     """Pairs of slots that share no vertex and whose boxes meet, of pairs of clusters that do."""
-    large = short.large.take(a) | short.large.take(b)
-    for words, chosen in ((short, np.flatnonzero(~large)), (None, np.flatnonzero(large))):
-        pairs = a.take(chosen), b.take(chosen), row.take(chosen)
-        for part in pieces(len(chosen), 3 * CLUSTER):
+    if short is None:
+        chosen = [(None, np.arange(len(a)))]
+    else:
+        large = short.large.take(a) | short.large.take(b)
+        chosen = [(short, np.flatnonzero(~large)), (None, np.flatnonzero(large))]
+    for words, some in chosen:
+        pairs = a.take(some), b.take(some), row.take(some)
+        for part in pieces(len(some), 3 * CLUSTER):
             yield from _meeting_across(layout, shape, boxes, words, *(x[part] for x in pairs))
 
 

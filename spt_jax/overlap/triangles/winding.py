@@ -231,8 +231,12 @@ def enclosing_parts(
 def _extremes(topology: Topology, manifold: Manifold, predicates: Predicates):
     """The parts that have triangles, and of each the vertex farthest along x."""
     used = np.flatnonzero(topology.used)
+    x = predicates.points[0].take(used)
+    if manifold.num_parts == 1 and len(used):
+        most = np.flatnonzero(x == x.max())
+        if len(most) == 1:
+            return np.zeros(1, np.int64), used[most]
     part = manifold.part[used]
-    x = predicates.points[0][used]
     order = np.argsort(part, kind="stable")
     start = np.flatnonzero(np.concatenate([[True], np.diff(part[order]) != 0])[: len(order)])
     names = part[order[start]]
