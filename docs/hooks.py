@@ -41,8 +41,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     add("notebooks/README.md", as_page(TOP / "notebooks" / "README.md"))
     add("benchmarks/results.md", as_page(RESULTS))
     add("security.md", as_page(TOP / ".github" / "SECURITY.md"))
-    for picture in sorted((TOP / "benchmarks" / "figures").glob("*.png")):
-        add(f"benchmarks/figures/{picture.name}", picture.read_bytes())
+    for picture in sorted((TOP / "benchmarks" / "figures").glob("*.*")):
+        if picture.suffix in (".png", ".webp"):  # the second moves
+            add(f"benchmarks/figures/{picture.name}", picture.read_bytes())
     return files
 
 
