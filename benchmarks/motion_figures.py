@@ -1,7 +1,7 @@
 """Pictures of a motion freed as a whole: `python -m benchmarks.motion_figures [--out DIR]`.
 
-A minute on two cores. Frames of `roll` moving before and after, and the curves of overlap and of second
-differences over them, beside those of the same frames freed one by one.
+A minute on two cores. Frames of `roll` moving before and after, and the curves of overlap and of
+second differences over them, beside those of the same frames freed one by one.
 """
 
 from pathlib import Path
