@@ -149,6 +149,8 @@ def _warn(summary: "Summary", out: Path) -> None:
         show(console, f"{one['status']}: {one['name']}: {one['message'][:300]}", "yellow")
     if len(wrong) > 5:
         show(console, f"and {len(wrong) - 5} more, in {out / 'summary.json'}", "yellow")
+    if "failed" in summary.by_status:
+        show(console, "note: with --retry, the same command tries failed files again", "yellow")
     if summary.missing:
         show(
             console, f"note: {summary.missing} files are not done: other shards', or left", "yellow"

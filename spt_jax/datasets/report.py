@@ -25,9 +25,10 @@ body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(
 table { border-collapse: collapse; margin: 1em 0; }
 th, td { padding: .2em .8em; border-bottom: 1px solid var(--line); text-align: right; }
 th:first-child, td:first-child { text-align: left; }
-td.text { text-align: left; max-width: 40em; overflow-wrap: anywhere; }
+table.text th, table.text td { text-align: left; max-width: 40em; overflow-wrap: anywhere; }
+.wide { overflow-x: auto; }
 figure { display: inline-block; margin: .5em; vertical-align: top; max-width: 500px; }
-figcaption { overflow-wrap: anywhere; font-size: 13px; }
+figcaption { overflow-wrap: anywhere; font-size: 13px; max-width: 500px; }
 img { max-width: 100%; border: 1px solid var(--line); }
 svg text { fill: var(--ink); font: 12px system-ui, sans-serif; }
 .before { fill: var(--before); } .after { fill: var(--after); }
@@ -59,14 +60,15 @@ def page(store: Store, rows: Sequence[Row], summary: Summary, why_not_drawn: str
         why_not_drawn: what stands in place of pictures.
     """
     done = [row for row in rows if row["status"] == "done" and row.get("frames")]
-    title = f"{summary.task} of {summary.files} files"
+    title = f"spt-jax {summary.task}: {_counted(summary.files, 'file')}"
     parts = [
         f"<h1>{escape(title)}</h1>",
         _overview(summary),
         *([_before_after(summary), *_distributions(done)] if done else []),
         _worst(store, done, why_not_drawn),
-        _grouped("By folder", done, lambda row: str(PurePosixPath(row["name"]).parent)),
+        _grouped("By folder", done, _folder_of),
         _people(done),
+        _notes(rows),
         _problems(summary),
     ]
     body = "\n".join(part for part in parts if part)
@@ -80,14 +82,31 @@ def page(store: Store, rows: Sequence[Row], summary: Summary, why_not_drawn: str
 def _overview(summary: Summary) -> str:
     counts = [f"{count} {status}" for status, count in summary.by_status.items()]
     counts += [f"{summary.missing} not done yet"] if summary.missing else []
-    said = f"<p>{summary.files} files: {escape(', '.join(counts) or 'none')}."
+    said = f"<p>{_counted(summary.files, 'file')}: {escape(', '.join(counts) or 'none')}."
     if summary.others:
         kinds = ", ".join(f"{count} {kind}" for kind, count in summary.others.items())
         said += f" Left alone, being of another kind: {escape(kinds)}."
     if summary.figures.get("frames"):
-        hours = summary.figures.get("processor_seconds", 0.0) / 3600
-        said += f" {summary.figures['frames']:,.0f} frames took {hours:.2f} hours of a core."
+        time = _time(summary.figures.get("processor_seconds", 0.0))
+        said += f" {_counted(summary.figures['frames'], 'frame')} took {time} of a core."
     return said + "</p>"
+
+
+def _counted(count: float, word: str) -> str:
+    """Such as "1 file" and "1,200 files"."""
+    return f"{count:,.0f} {word}{'' if count == 1 else 's'}"
+
+
+def _time(seconds: float) -> str:
+    """In the unit that people would say it in."""
+    if seconds >= 5400:
+        return f"{seconds / 3600:,.1f} hours"
+    return f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.1f} seconds"
+
+
+def _folder_of(row: Row) -> str:
+    folder = str(PurePosixPath(row["name"]).parent)
+    return "the data set's own" if folder == "." else folder
 
 
 def _before_after(summary: Summary) -> str:
@@ -125,7 +144,7 @@ def _distributions(rows: Sequence[Row]) -> list[str]:
 
 
 def _bars(labels: Sequence[str], series: Sequence[tuple[str, Sequence[int]]]) -> str:
-    """Bars of the share of frames, on a scale of logarithms, with their counts."""
+    """Bars of how many frames there are, on a scale of logarithms, with the counts."""
     import math
 
     width, height, left = 80, 150, 10
@@ -148,15 +167,13 @@ def _bars(labels: Sequence[str], series: Sequence[tuple[str, Sequence[int]]]) ->
                 f'<text x="{at + wide / 2:.1f}" y="{top - 3:.1f}" text-anchor="middle">'
                 f"{counts[k] or ''}</text>"
             )
-    legend = ""
+    keys = ""
     if len(series) > 1:
-        legend = (
-            '<p><svg width="12" height="12"><rect class="before" width="12" height="12"/></svg> '
-        )
-        legend += 'before <svg width="12" height="12"><rect class="after" width="12" height="12"/>'
-        legend += "</svg> after; heights are logarithms of the counts</p>"
+        box = '<svg width="12" height="12"><rect class="{0}" width="12" height="12"/></svg> {0}'
+        keys = f"{box.format('before')} {box.format('after')}; "
+    legend = f"<p>{keys}heights are logarithms of the counts</p>"
     size = f'width="{left + width * len(labels)}" height="{height + 45}"'
-    return f'{legend}<svg {size} role="img">{"".join(drawn)}</svg>'
+    return f'{legend}<div class="wide"><svg {size} role="img">{"".join(drawn)}</svg></div>'
 
 
 def _worst(store: Store, rows: Sequence[Row], why_not_drawn: str) -> str:
@@ -164,21 +181,21 @@ def _worst(store: Store, rows: Sequence[Row], why_not_drawn: str) -> str:
     if not found:
         return ""
     when = "_before" if "largest_depth_before" in found[0] else ""
-    head = ["file", "person", "frame", "depth, mm", "volume, cm³"]
+    head = ["file", "person", "frame, from 0", "depth, mm", "volume, cm³"]
     head += ["depth after", "volume after"] if when else []
     table = []
     for row in found:
         cells = [row["name"], row["worst_person"], str(row["worst_frame"])]
         for suffix in (when, "_after") if when else ("",):
             cells.append(f"{1e3 * row[f'largest_depth{suffix}']:.1f}")
-            cells.append(f"{1e6 * row[f'largest_volume{suffix}']:.2f}")
+            cells.append(f"{1e6 * row[f'largest_volume{suffix}']:,.2f}")
         table.append(cells)
     figures = []
     for row in found:
         path = picture_of(store, row)
         if path.exists():
             content = base64.b64encode(path.read_bytes()).decode()
-            name = f"{escape(row['name'])}, frame {row['worst_frame']}"
+            name = escape(f"{row['name']}, {row['worst_person']}, frame {row['worst_frame']}")
             figures.append(
                 f'<figure><img alt="{name}" src="data:image/png;base64,{content}">'
                 f"<figcaption>{name}</figcaption></figure>"
@@ -223,21 +240,47 @@ def _people(rows: Sequence[Row]) -> str:
     return _grouped("By person", people, lambda one: f"{one['name']}: {one['person']}")
 
 
-def _problems(summary: Summary) -> str:
-    if not summary.failures:
+def _notes(rows: Sequence[Row]) -> str:
+    """What was decided about files, and what is in them and not used, each said once."""
+    files: dict[str, list[str]] = {}
+    for row in rows:
+        for note in row.get("notes", ()):
+            files.setdefault(note, []).append(row["name"])
+    if not files:
         return ""
-    rows = [[one["name"], one["status"], one["message"]] for one in summary.failures]
-    return f"<h2>Files without a result</h2>\n{_table(['file', 'status', 'why'], rows, text=True)}"
+    table = sorted(([note, str(len(names)), names[0]] for note, names in files.items()), key=_many)
+    return f"<h2>Notes</h2>\n{_table(['note', 'files', 'such as'], table, text=True)}"
+
+
+def _many(cells: Sequence[str]) -> tuple[int, str]:
+    return -int(cells[1]), cells[0]
+
+
+def _problems(summary: Summary) -> str:
+    """Failed files first; those that are none of the kind are folded away."""
+    parts = []
+    bad = [one for one in summary.failures if one["status"] != "unknown"]
+    if bad:
+        rows = [[one["name"], one["status"], one["message"]] for one in bad]
+        parts.append("<h2>Files without a result</h2>")
+        parts.append(_table(["file", "status", "why"], rows, text=True))
+    unknown = [[one["name"], one["message"]] for one in summary.failures if one not in bad]
+    if unknown:
+        title = f"{_counted(summary.by_status.get('unknown', 0), 'file')} of another kind"
+        table = _table(["file", "why"], unknown, text=True)
+        parts.append(f"<details><summary>{title}</summary>\n{table}\n</details>")
+    return "\n".join(parts)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, text: bool = False) -> str:
     kind = ' class="text"' if text else ""
-    lines = ["<table>", "<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
+    lines = [f'<div class="wide"><table{kind}>']
+    lines.append("<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>")
     lines += [
-        "<tr>" + "".join(f"<td{kind}>{escape(cell)}</td>" for cell in row) + "</tr>"
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
         for row in rows[:_MOST_ROWS]
     ]
-    lines.append("</table>")
+    lines.append("</table></div>")
     if len(rows) > _MOST_ROWS:
         lines.append(f"<p>and {len(rows) - _MOST_ROWS} more, in manifest.csv and summary.json</p>")
     return "\n".join(lines)

@@ -7,11 +7,12 @@ import re
 import numpy as np
 import pytest
 from helpers_motion import snap, tongs
+from helpers_penalty import compiled_names
 
 from spt_jax import datasets, load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.cli.main import main
-from spt_jax.datasets.motions import CleanMotions
+from spt_jax.datasets.motions import CleanMotions, MeasureMotions
 from spt_jax.io import load_poses
 from spt_jax.metrics import motion_overlap
 from spt_jax.untangle.motion_input import up_of
@@ -161,7 +162,10 @@ def test_pandas_and_duckdb_read_the_rows_as_they_are(measured):
 
 def test_the_report_of_a_measured_folder(measured):
     page = (measured / "report.html").read_text()
-    for words in ("The worst 2", "a/snap.npz", "By folder", "By person", "two.npz: 0", "cut.npz"):
+    for words in (
+        *("The worst 2", "a/snap.npz", "By folder", "By person", "two.npz: 0", "cut.npz"),
+        *("not used: extra", "1 file of another kind", "mesh.npz", "heights are logarithms"),
+    ):
         assert words in page, words
     assert page.count("<rect") == 2 * 9 and "after" not in page.split("</style>")[1]
 
@@ -243,6 +247,35 @@ def test_faults_of_the_caller(folder, tmp_path, capsys):
     assert main(["clean", str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.startswith("spt-jax: folder must exist: got ")
     assert not list(tmp_path.iterdir())
+
+
+def compiled_after_the_first(task, tmp_path):
+    """What is compiled for files of other lengths, after one of 41 frames."""
+    task.start()
+    pose = as_smpl(snap())
+    for number, rows in enumerate((slice(None), slice(5, 28), slice(20, 21), slice(8, 36))):
+        np.save(tmp_path / f"{number}.npy", pose[rows])
+    out = tmp_path / "out"
+    out.mkdir()
+    said = []
+    for number in range(4):
+        with compiled_names() as names:
+            row = task.work(tmp_path / f"{number}.npy", out, lambda *_: None)
+        said.append(names)
+        assert row["frames"] == (41, 23, 1, 28)[number]
+    assert said[0]  # the count counts
+    return [name for names in said[1:] for name in names]
+
+
+@pytest.mark.usefixtures("with_tongs")
+def test_measuring_compiles_once_for_files_of_all_lengths(tmp_path):
+    assert not compiled_after_the_first(MeasureMotions(), tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("with_tongs")
+def test_cleaning_compiles_once_for_files_of_all_lengths(tmp_path):
+    assert not compiled_after_the_first(CleanMotions(), tmp_path)
 
 
 def test_which_way_is_up():
