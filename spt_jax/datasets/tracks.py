@@ -70,7 +70,10 @@ def on_body(track: Track, body: BodyModel, *, embedded: bool, expressions: int) 
             what = f"expressions after the body's {expressions}" if expressions else "expressions"
             notes.append(f"{what} are left out")
     place = np.zeros((count, 3)) if track.translation is None else track.translation
-    pose = np.asarray(body.pose_from_smpl(track.pose.astype(np.float32)))
+    # Batch by batch: JAX compiles what is done with arrays for each of their lengths.
+    given = track.pose.astype(np.float32)
+    parts = [np.asarray(body.pose_from_smpl(given[at]))[:left] for at, left in _batches(count)]
+    pose = np.concatenate(parts)
     return Posed(pose, shape, place.astype(np.float32), tuple(notes))
 
 
@@ -97,11 +100,15 @@ def _vertices(body: BodyModel, pose: Any, shape: Any, translation: Any) -> Any:
 
 def skins(body: BodyModel, posed: Posed) -> Iterator[Float[np.ndarray, "N V 3"]]:
     """The vertices of all frames, at most `BATCH` frames at a time."""
-    count = len(posed.pose)
-    for start in range(0, count, BATCH):
-        at = np.minimum(np.arange(start, start + BATCH), count - 1)
+    for at, left in _batches(len(posed.pose)):
         found = _vertices(body, posed.pose[at], posed.shape[at], posed.translation[at])
-        yield np.asarray(found)[: count - start]
+        yield np.asarray(found)[:left]
+
+
+def _batches(count: int) -> Iterator[tuple[np.ndarray, int]]:
+    """`BATCH` frames at a time, the last one repeated, and how many are left with the first."""
+    for start in range(0, count, BATCH):
+        yield np.minimum(np.arange(start, start + BATCH), count - 1), count - start
 
 
 def second_differences(body: BodyModel, posed: Posed) -> tuple[float, float]:

@@ -118,8 +118,10 @@ def displacement_factors(body: AbstractBody, frames: Frames) -> Float[np.ndarray
     # As many from the end as from the start: a motion played backwards weighs the same.
     chosen = np.concatenate([spread, count - 1 - spread])
     stride = max(body.num_vertices // _SAMPLED_VERTICES, 1)
-    forms = _displacement_forms(body, frames.at(chosen), stride)
-    form = np.asarray(forms, np.float64).mean(axis=0)
+    # One program for windows of all lengths: in short ones the last frame stands in for others.
+    filled = np.pad(chosen, (0, 2 * _SAMPLED_FRAMES - len(chosen)), mode="edge")
+    forms = _displacement_forms(body, frames.at(filled), stride)
+    form = np.asarray(forms, np.float64)[: len(chosen)].mean(axis=0)
     return np.linalg.cholesky(form + STIFFNESS * np.eye(form.shape[-1]))
 
 

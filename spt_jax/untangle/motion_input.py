@@ -94,6 +94,10 @@ def as_up(up: Any) -> Float[np.ndarray, "3"]:
     return direction / np.linalg.norm(direction)
 
 
+# Frames by which `up_of` goes.
+_LOOKED_AT = 64
+
+
 def up_of(body: AbstractBody, pose: Any) -> tuple[float, float, float]:
     """The axis, of six, along which heads are above roots in most of a motion: that is up.
 
@@ -105,10 +109,12 @@ def up_of(body: AbstractBody, pose: Any) -> tuple[float, float, float]:
     """
     names = body.joint_names
     top = names.index("head") if "head" in names else len(names) - 1
-    some = np.unique(np.linspace(0, len(pose) - 1, 64).astype(int))
+    some = np.unique(np.linspace(0, len(pose) - 1, _LOOKED_AT).astype(int))
+    # As many for motions of all lengths, so that one program does for them.
+    filled = np.pad(some, (0, _LOOKED_AT - len(some)), mode="edge")
     # A joint alone: no vertex is posed.
-    joints = np.asarray(body.at_vertices([])(jnp.asarray(np.asarray(pose)[some])).joints)
-    mean = (joints[:, top] - joints[:, 0]).mean(axis=0)
+    joints = np.asarray(body.at_vertices([])(jnp.asarray(np.asarray(pose)[filled])).joints)
+    mean = (joints[:, top] - joints[:, 0])[: len(some)].mean(axis=0)
     direction = [0.0, 0.0, 0.0]
     axis = int(np.abs(mean).argmax())
     direction[axis] = 1.0 if mean[axis] >= 0 else -1.0

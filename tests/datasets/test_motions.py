@@ -4,6 +4,7 @@ import csv
 import json
 import re
 
+import jax
 import numpy as np
 import pytest
 from helpers_motion import snap, tongs
@@ -250,21 +251,28 @@ def test_faults_of_the_caller(folder, tmp_path, capsys):
 
 
 def compiled_after_the_first(task, tmp_path):
-    """What is compiled for files of other lengths, after one of 41 frames."""
+    """What is compiled for files of other lengths, after one of 41 frames.
+
+    Without what JAX compiles to copy, fill and cast an array, a few milliseconds each.
+    """
     task.start()
     pose = as_smpl(snap())
     for number, rows in enumerate((slice(None), slice(5, 28), slice(20, 21), slice(8, 36))):
         np.save(tmp_path / f"{number}.npy", pose[rows])
     out = tmp_path / "out"
     out.mkdir()
+    with compiled_names() as said:
+        jax.jit(lambda x: 2 * x)(1.0)
+    assert said  # the count counts
     said = []
     for number in range(4):
         with compiled_names() as names:
             row = task.work(tmp_path / f"{number}.npy", out, lambda *_: None)
         said.append(names)
         assert row["frames"] == (41, 23, 1, 28)[number]
-    assert said[0]  # the count counts
-    return [name for names in said[1:] for name in names]
+    small = ("stage", "broadcast_in_dim", "reshape", "_where", "convert_element_type")
+    found = [name for names in said[1:] for name in names]
+    return [name for name in found if not any(f"jit({op})" in name for op in small)]
 
 
 @pytest.mark.usefixtures("with_tongs")
