@@ -23,6 +23,7 @@ from scipy.spatial import ConvexHull
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.measure import Unmeasurable, measure
 from spt_jax.overlap.surface import ExactSurface
+from spt_jax.overlap.triangles import winding
 
 FRAMES = ["roll/0053", "crawl/0092", "dance_a/0068"]
 
@@ -310,3 +311,19 @@ def test_parts_of_every_number_and_sense(rng):
     for mesh in (join(star, moved(star, random_rotation(rng), (0.2, 0.1, 0.3))), hulls(rng, 3)):
         many = [moved(mesh, translation=(20.0 * k, 0, 0)) for k in range(20)]
         np.testing.assert_array_equal(w_out(join(*many)), np.tile(w_out(mesh), 20))
+
+
+@pytest.mark.parametrize("ranks", [False, True])
+def test_columns_of_rays_miss_no_triangle(rng, ranks):
+    points = rng.integers(0, 12, (3, 300)) if ranks else rng.random((3, 300))
+    faces, rays = rng.integers(0, 300, (200, 3)), points[:, rng.integers(0, 300, 40)]
+
+    def meeting(found):
+        ray, face = found
+        z = points[2][faces[face]]
+        kept = (z.min(axis=1) <= rays[2, ray]) & (z.max(axis=1) >= rays[2, ray])
+        return sorted(zip(ray[kept].tolist(), face[kept].tolist(), strict=True))
+
+    assert meeting(winding._columns(rays, points, faces)) == meeting(
+        winding._rows(rays, points, faces)
+    )

@@ -304,6 +304,47 @@ def _range(places, faces):
     return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
 
+def _rows(point, places, faces):
+    """Pairs of ray and triangle that meet in y: every ray against all triangles, in blocks."""
+    low, high = _range(places[1], faces)
+    found = [np.zeros((2, 0), np.int64)]
+    each = max(_AT_ONCE // max(len(faces), 1), 1)
+    for begin in range(0, point.shape[1], each):
+        y = point[1, begin : begin + each, None]
+        ray, face = np.nonzero((low <= y) & (high >= y))
+        found.append(np.stack([ray + begin, face]))
+    return np.concatenate(found, axis=1)
+
+
+def _columns(point, places, faces):
+    """The same, less most of those that miss in z: a scene of many parts has a ray for each.
+
+    Rays are cut by their order along z into columns, and sorted by their order along y in each. A
+    triangle reaches some of the columns, and in each a run of rays.
+    """
+    count = point.shape[1]
+    low, high, rank = [], [], []
+    for axis in (1, 2):
+        order = np.argsort(point[axis], kind="stable")
+        rank.append(np.empty(count, np.int64))
+        rank[-1][order] = np.arange(count)
+        values = point[axis, order]
+        least, most = _range(places[axis], faces)
+        low.append(np.searchsorted(values, least, side="left"))
+        high.append(np.searchsorted(values, most, side="right"))
+    wide = max(int(np.sqrt(count)), 1)
+    key = rank[1] // wide * count + rank[0]
+    order = np.argsort(key)
+    met = np.flatnonzero((low[0] < high[0]) & (low[1] < high[1]))
+    first = low[1][met] // wide
+    column, of = spread(first, (high[1][met] - 1) // wide - first + 1)
+    of = met[of]
+    begin = np.searchsorted(key[order], column * count + low[0][of])
+    end = np.searchsorted(key[order], column * count + high[0][of])
+    at, of_run = spread(begin, end - begin)
+    return order[at], of[of_run]
+
+
 def _rays(predicates: Predicates, faces, vertex, part, part_of_face):
     """Where rays along x from these vertices meet triangles of other parts: ray, triangle, sign.
 
@@ -313,22 +354,9 @@ def _rays(predicates: Predicates, faces, vertex, part, part_of_face):
     # In one place vertices follow their pushes, where that order is known.
     places = vars(predicates).get("ranks", predicates.points)
     point = places.take(vertex, axis=1)
-    low, high = _range(places[1], faces)
-    found = [np.zeros((2, 0), np.int64)]
-    order = ascending = None
-    if len(vertex) > _FEW_RAYS:
-        order = np.argsort(low, kind="stable")
-        ascending, low, high = low[order], low[order], high[order]
-    each = max(_AT_ONCE // max(len(faces), 1), 1)
-    for begin in range(0, len(vertex), each):
-        y = point[1, begin : begin + each]
-        # Triangles that begin below a ray in y and reach above it, in blocks of rays.
-        stop = len(low)
-        if ascending is not None:
-            stop = int(np.searchsorted(ascending, y.max(), side="right"))
-        ray, at = np.nonzero((low[:stop] <= y[:, None]) & (high[:stop] >= y[:, None]))
-        found.append(np.stack([ray + begin, at if order is None else order[at]]))
-    ray, face = np.concatenate(found, axis=1)
+    ray, face = (
+        _columns(point, places, faces) if len(vertex) > _FEW_RAYS else _rows(point, places, faces)
+    )
     kept = np.flatnonzero(part_of_face[face] != part[ray])
     ray, face = ray[kept], face[kept]
     for axis in (2, 0):
