@@ -71,12 +71,10 @@ def files(folder: Path) -> list[tuple[str, str, Path]]:
         return folder / name
 
     arrays = smplx()
-    np.savez_compressed(  # pyright: ignore[reportArgumentType]
-        add("SMPL-X's arrays, compressed", "body", "smplx.npz"), **arrays
-    )
-    np.savez(  # pyright: ignore[reportArgumentType]
-        add("the same, not compressed", "body", "smplx_plain.npz"), **arrays
-    )
+    compressed = add("SMPL-X's arrays, compressed", "body", "smplx.npz")
+    np.savez_compressed(compressed, **arrays)  # pyright: ignore[reportArgumentType]
+    plain = add("the same, not compressed", "body", "smplx_plain.npz")
+    np.savez(plain, **arrays)  # pyright: ignore[reportArgumentType]
     for protocol, what in ((4, "pickled"), (2, "pickled with protocol 2: bytes as text")):
         path = add(f"the same, {what}", "body", f"smplx{protocol}.pkl")
         path.write_bytes(pickle.dumps(arrays, protocol=protocol))

@@ -70,7 +70,8 @@ def test_obj_keeps_all_but_positions_and_brings_its_materials(tmp_path):
 def test_names_in_a_mesh_reach_nothing_outside_of_its_folder(tmp_path):
     (tmp_path / "secret.mtl").write_text("newmtl x")
     inner, out = tmp_path / "in", tmp_path / "out"
-    inner.mkdir(), out.mkdir()
+    inner.mkdir()
+    out.mkdir()
     file = write_obj(inner)
     file.write_text(file.read_text().replace("two parts.mtl", "../secret.mtl"))
     opened = open_mesh(file)
