@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from spt_jax import self_intersection_penalty
 from spt_jax.bridge import callback
 from spt_jax.overlap import host_functions
-from spt_jax.overlap.measure import measure
+from spt_jax.overlap.measure import Measurement, measure
 
 
 @pytest.mark.parametrize("value", ["volume", "ratio"])
@@ -116,16 +116,15 @@ def test_what_the_dtype_cannot_hold_is_nan_or_zero_with_no_gradient(dtype, rays)
         assert np.isfinite(value) and value > 0 and np.abs(gradient).any()
 
 
-@pytest.mark.parametrize("volume", [-1.2e-18, -0.0, 1e-320])
-def test_a_volume_below_rounding_is_zero_and_has_no_gradient(monkeypatch, volume):
-    class Found:
-        def __init__(self):
-            self.volume = volume
+@pytest.mark.parametrize("volume_by_rounding", [-1.2e-18, -0.0, 1e-320])
+def test_a_volume_below_rounding_is_zero_and_has_no_gradient(monkeypatch, volume_by_rounding):
+    class Rounded(Measurement):
+        volume = volume_by_rounding
 
         def gradient(self, *_):
             return np.ones(PAIR[0].shape)
 
-    monkeypatch.setattr(host_functions, "measure", lambda *_: Found())
+    monkeypatch.setattr(host_functions, "measure", lambda *mesh: Rounded(*mesh))
     value, gradient = jax.value_and_grad(loss)(as_jax(PAIR, "float32") + 0.3)
     assert value == 0 and not np.signbit(value) and not np.abs(gradient).any()
     callback.clear_results()

@@ -122,7 +122,7 @@ def measured(
         exact = options.sampling.rays is None
         if exact and is_small_convex_solid(vertices, faces, options.rounding):
             return np.zeros(()), nothing, None
-        found = _where_it_counts(vertices, faces, options)
+        found = _measured_unless_zero(vertices, faces, options)
         if found is None:
             return np.zeros(()), nothing, None
         value = np.array(criterion.of(found, options.rule), np.float64)
@@ -142,7 +142,7 @@ def measured(
     return value, gradient, found if known else None
 
 
-def _where_it_counts(
+def _measured_unless_zero(
     vertices: Vertices, faces: Faces, options: PenaltyOptions
 ) -> Measurement | None:
     """The mesh measured; None where it is shown to be zero by less."""
@@ -150,16 +150,16 @@ def _where_it_counts(
         return None
     # Whether it is asked at first depends on the shapes before. What is returned must not: so
     # where a measurement fails or falls back on rays it is asked at last.
-    told = options.sampling.rays is None and CRITERIA[options.value].power > 0
-    if told and only_folds(vertices, faces, options.exclusions):
+    asked = options.sampling.rays is None and CRITERIA[options.value].power > 0
+    if asked and only_folds(vertices, faces, options.exclusions):
         return None
     try:
         found = measure(vertices, faces, options.sampling, options.exclusions, options.rounding)
     except Unmeasurable:
-        if told and only_folds(vertices, faces, options.exclusions, surely=True):
+        if asked and only_folds(vertices, faces, options.exclusions, surely=True):
             return None
         raise
-    if told and not found.exact and only_folds(vertices, faces, options.exclusions, surely=True):
+    if asked and not found.exact and only_folds(vertices, faces, options.exclusions, surely=True):
         return None
     return found
 

@@ -133,7 +133,7 @@ EXPECTED = {
         " with adapt", "body_pose", "collision-free", "fit for the penalty", "after"
     ),
     "recipes/rigs.md": prints("52 joints, ('Cartwheel',)", "0 after", "('Cartwheel untangled',)"),
-    "recipes/pose-files.md": prints("walk (5, 22, 3) 120.0 female", "free of 52 joints"),
+    "recipes/pose-files.md": prints("walk (5, 22, 3) 120.0 female", "5 frames of 52 joints"),
     "recipes/datasets.md": prints("{'done': 2} {'.txt': 1}", "of 6 frames collide, 0 after"),
     "recipes/motions.md": prints(
         "after: 0", "leave it out: False False", "'motion.glb'", "cm^3", "mm deep", "in contact"
