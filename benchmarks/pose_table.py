@@ -183,8 +183,10 @@ Embedded body with random shape coefficients (clipped at 2), a random turn about
 5 m from a camera of focal length 1200 pixels; frames of motion capture whose body has no collision
 in that shape (folds aside; by the penalty and by ipctk). {joints} joints are given, the shape is
 known, pose and translation are fitted. All methods: the same six orientations and flips, then three
-stages of at most 20 steps of BFGS with a weight rising to the one shown (RE: the same stages with
-none; "paper": gradient descent on the ratio with the unit gradient, 512 x 512 rays, one direction).
+stages with a weight rising to the one shown, of at most 20 steps of BFGS each (RE: the same stages
+with none). RE + SPT: stages of the penalty's own search on the host, by cuts; the last one goes on,
+with more weight and a margin of 1 to 4 mm, until no parts intersect. "Paper": gradient descent on
+the ratio with the unit gradient, 512 x 512 rays, one direction.
 Means with 95 % bootstrap intervals; differences are paired. RE + LR: Wang et al. 2018, RE + SA:
 Pons-Moll et al. 2015 with spheres fitted to the body. "Without folds":
 `classify_vertices(..., rest_surface=body.rest_surface)`. Reprojection: mean distance of the seen
