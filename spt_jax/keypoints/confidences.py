@@ -22,7 +22,14 @@ _NO_CONFIDENCES = ("x", "y", "z", "name")
 _SAME = 1e-5
 
 
-def as_rows(where: str, values: Any, entry: Mapping[str, Any], remarks: Counter[str]) -> list[Any]:
+def as_rows(
+    where: str,
+    values: Any,
+    entry: Mapping[str, Any],
+    remarks: Counter[str],
+    *,
+    key: str | None = None,
+) -> list[Any]:
     """The numbers of one person's keypoints as one flat list x, y, confidence, x, y, ...
 
     Args:
@@ -31,25 +38,27 @@ def as_rows(where: str, values: Any, entry: Mapping[str, Any], remarks: Counter[
             {"x": [...], "y": [...], ...}.
         entry: what stands beside them; one of CONFIDENCES may be the points' confidences.
         remarks: of what is left out or assumed, which are counted up.
+        key: what the values are called in the file, where `where` does not say it.
 
     Raises:
         ValueError: they are no such list; numbers beside them that may be confidences, under an
             unknown name; confidences in the rows and beside them that differ.
     """
-    values, entry = _without_objects(where, values, entry)
+    listed = where if key is None else f"{key} of {where}"
+    values, entry = _without_objects(listed, values, entry)
     if not isinstance(values, list) or not values:
         raise ValueError(
-            f"{where} must be a list of x, y and confidence: got {shown(values)}; leave out a "
+            f"{listed} must be a list of x, y and confidence: got {shown(values)}; leave out a "
             "person without keypoints."
         )
     if any(isinstance(row, list) for row in values):
         rows = values
     else:
-        rows = _pairs_or_triples(where, values, entry)
+        rows = _pairs_or_triples(listed, values, entry)
     for k, row in enumerate(rows):
         if not isinstance(row, list) or len(row) not in (2, 3) or len(row) != len(rows[0]):
             raise ValueError(
-                f"{where} must have rows [x, y, confidence], or all [x, y]: got {shown(row)} for "
+                f"{listed} must have rows [x, y, confidence], or all [x, y]: got {shown(row)} for "
                 f"keypoint {k}."
             )
     known = _confidences_beside(where, entry, len(rows), remarks)

@@ -134,7 +134,7 @@ def person_of(
     if isinstance(values, list) and order is None and values and isinstance(values[0], dict):
         names = [point.get("name") for point in values if isinstance(point, dict)]
         order = source.named(names, where) if any(names) else None
-    flat = as_rows(where, values, entry, source.remarks)
+    flat = as_rows(where, values, entry, source.remarks, key=key)
     for name, count in parts:
         beside = entry.get(name)
         more = as_rows(f"{name} of {where}", beside, {}, source.remarks) if beside else []
