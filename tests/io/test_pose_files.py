@@ -90,6 +90,7 @@ def test_a_pickled_key_that_is_not_needed_is_left_alone(tmp_path):
     ("arrays", "message"),
     [
         ({"poses": np.zeros((5, 70))}, r"poses must hold frames of 22 or 24.*\(5, 70\).*bad\.npz"),
+        ({"poses": np.zeros((5, 48))}, r"must hold poses of a body: got 16 .* MANO, in .*bad\.npz"),
         ({"poses": np.zeros((0, 66))}, "at least one frame"),
         ({"pose": np.zeros((23, 3))}, r"got shape \(23, 3\)"),
         ({"poses": np.zeros((5, 24, 3, 3))}, r"poses must hold rotation matrices"),

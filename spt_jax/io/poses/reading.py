@@ -35,7 +35,7 @@ from spt_jax.io.poses.people import (
     read_slahmr,
     read_tram,
 )
-from spt_jax.io.poses.source import Source
+from spt_jax.io.poses.source import Source, UnknownStructureError
 from spt_jax.io.poses.track import MotionFile, Track
 from spt_jax.io.poses.whole import POSES, is_motion_x, read_bare, read_motion_x, read_whole
 
@@ -55,10 +55,6 @@ def is_pose_file(path: str | os.PathLike[str]) -> bool:
     if os.path.isdir(path):
         return True
     return os.path.splitext(os.fspath(path))[1].lower() in (*SUFFIXES, *_OTHERS, "")
-
-
-class UnknownStructureError(ValueError):
-    """A file that was read and holds poses in no structure that is known, or no poses."""
 
 
 class Structure(NamedTuple):

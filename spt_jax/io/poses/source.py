@@ -21,6 +21,10 @@ MOST_METRES = 1e9
 _GENDERS = {"m": "male", "f": "female", "n": "neutral"}
 
 
+class UnknownStructureError(ValueError):
+    """A file that was read and holds poses in no structure that is known, or no poses."""
+
+
 class Block(NamedTuple):
     """Rotations that stand together in a file.
 

@@ -5,12 +5,22 @@ from typing import Any
 import numpy as np
 
 from spt_jax.io.poses.parts import has_parts, read_parts, track_of
-from spt_jax.io.poses.rotations import AXIS_ANGLE
-from spt_jax.io.poses.source import MOST_METRES, MOST_SHAPE, Block, Source, Way, spelt
+from spt_jax.io.poses.rotations import AXIS_ANGLE, MATRIX, form_of
+from spt_jax.io.poses.source import (
+    MOST_METRES,
+    MOST_SHAPE,
+    Block,
+    Source,
+    UnknownStructureError,
+    Way,
+    spelt,
+)
 from spt_jax.io.poses.track import Track
 
 JOINT_COUNTS = (22, 24, 52, 55)
 """Body alone; SMPL; SMPL-H, with fingers; SMPL-X, with jaw and eyes before the fingers."""
+# The wrist and three joints a finger, which are read as no body.
+_HAND = 16
 POSES = ("poses", "pose", "fullpose")
 # Motion-X: where in the 322 numbers of a frame what stands.
 _MOTION_X = {
@@ -25,13 +35,21 @@ def whole_pose(source: Source, way: Way, index: tuple[Any, ...] = ()) -> tuple[n
     """Frames of whole poses of SMPL's layouts.
 
     Raises:
+        UnknownStructureError: the poses are those of a hand.
         ValueError: the array has another shape.
     """
     for count in JOINT_COUNTS:
         found = source.rotations(way, range(count), index=index)
         if found is not None:
             return found
-    shape = source.numbers(way, index).shape
+    values = source.numbers(way, index)
+    if form_of(values, _HAND, forms=(AXIS_ANGLE, MATRIX)) is not None:
+        raise UnknownStructureError(
+            f"{spelt(way)} must hold poses of a body: got {_HAND} rotations a frame, as those of "
+            f"one hand of MANO, in {source.file!r}; in Python, untangle_pose with load_body of a "
+            "MANO file takes them"
+        )
+    shape = values.shape
     raise ValueError(
         f"{spelt(way)} must hold frames of 22 or 24 or 52 or 55 rotations, as axis-angle (N, J, 3) "
         f"or (N, 3 J), matrices, 6D or quaternions: got shape {shape} in {source.file!r}"
