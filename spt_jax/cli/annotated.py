@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
 _DISTORTION = ("dist", "k1", "k2", "k3", "p1", "p2", "radial", "tangential")
-_LEAST_SIDE = 64  # of an image that is only known by the points in it, in pixels
 
 
 @dataclass(frozen=True)
@@ -261,6 +260,8 @@ def _size(
     image: str, people: Sequence["Person"], photograph: Path | None, max_bytes: int | None
 ) -> tuple[int, int]:
     """Of the file, else of the photograph, else of an image with the points in its middle."""
+    from spt_jax.keypoints.image_size import guessed_image_size
+
     stated = {(p.width, p.height) for p in people if p.width and p.height}
     told = stated.pop() if stated else None
     seen = None if photograph is None else _photograph_size(photograph, max_bytes)
@@ -274,11 +275,7 @@ def _size(
         return width, height
     if told is not None:
         return told
-    points = np.concatenate([person.points[person.confidence > 0] for person in people])
-    # As much room on the right and below as on the left and above.
-    room = np.maximum(points.min(axis=0), 0)
-    width, height = np.ceil(np.maximum(points.max(axis=0) + room, _LEAST_SIDE))
-    return int(width), int(height)
+    return guessed_image_size(people)
 
 
 def _photograph_size(path: Path, max_bytes: int | None) -> tuple[int, int] | None:

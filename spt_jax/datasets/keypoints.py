@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from spt_jax.keypoints import KeypointFile
     from spt_jax.keypoints.entries import Person
 
-_LEAST_SIDE = 64.0
-
 
 @dataclass
 class FitKeypoints:
@@ -178,14 +176,12 @@ class FitKeypoints:
 def _camera_of(people: Sequence["Person"]) -> "PinholeCamera":
     """One that spans 55 degrees over the longer side of the image of some people."""
     from spt_jax._camera import PinholeCamera
+    from spt_jax.keypoints.image_size import guessed_image_size
 
     stated = next(((p.width, p.height) for p in people if p.width and p.height), None)
     if stated is not None:
         return PinholeCamera.from_field_of_view(float(stated[0]), float(stated[1]))
-    points = np.concatenate([person.points[person.confidence > 0] for person in people])
-    # As much room on the right and below as on the left and above.
-    room = np.maximum(points.min(axis=0), 0)
-    width, height = np.ceil(np.maximum(points.max(axis=0) + room, _LEAST_SIDE))
+    width, height = guessed_image_size(people)
     return PinholeCamera.from_field_of_view(float(width), float(height))
 
 
