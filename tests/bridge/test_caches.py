@@ -45,7 +45,7 @@ def test_a_bounded_jit_forgets_and_still_answers():
     assert len(bounded) == 0 and bounded(2.0, jnp.ones(1))[0] == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["value", "gradient"])
 def test_inflating_meshes_of_ever_other_sizes_keeps_a_bounded_number_of_programs(how):
     """Under `jax.grad`, too, where arrays are tracers and programs are compiled all the same."""

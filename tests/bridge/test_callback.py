@@ -30,8 +30,9 @@ def run(*arguments, timeout):
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize(
+    "cores", [pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_no_deadlock(cores):
     """https://github.com/jax-ml/jax/issues/24255, https://github.com/jax-ml/jax/issues/25861.
 

@@ -64,7 +64,7 @@ def test_a_motion_is_freed_as_a_whole(tmp_path, capsys):
     assert report["settings"]["up"] == [0.0, 1.0, 0.0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frame_by_frame_where_that_is_said(tmp_path, capsys, monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("no motion was asked for")

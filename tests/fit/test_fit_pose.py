@@ -176,7 +176,7 @@ def traced(people):
     return call(jnp.asarray(people[2][:5]), jnp.asarray(trust), camera())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_under_jit_and_vmap_as_outside(plain, traced):
     assert agreeing(traced, jax.tree.map(lambda leaf: leaf[:5], plain))[:4].all()
 
@@ -225,7 +225,7 @@ class Crouch(Regularizer):
         return 100 * jnp.sum((joints[:, head, 1] - joints[:, 0, 1]) ** 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ones_own_start_and_regularizer_in_double_precision(x64):
     """From a given pose, with shape, one keypoint wrong, the body's place known."""
     body = embedded_body()
@@ -329,7 +329,7 @@ def test_what_still_intersects_is_said(plain, monkeypatch):
     assert not stuck.converged.any() and "Intersections are left" in stuck.reason[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_limbs_are_swung_to_other_sides_where_nothing_else_helps(plain, monkeypatch):
     del plain
     body, point = embedded_body(), np.asarray(seen(frames(COLLIDING[0])))[0]

@@ -60,7 +60,7 @@ def test_frames_far_from_a_collision_are_those_given_to_the_bit():
     assert still.rounds == 0 and not still.moved.any() and np.asarray(still.is_free).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_backwards_is_the_same_motion_backwards(x64):
     body, pose = tongs(dtype="float64"), snap(dtype="float64")
     there = untangle_motion(body, pose)
@@ -283,7 +283,7 @@ def pair_of_people(frames=21, apart=0.42):
     return pose, places
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_people_are_freed_together_and_counted_apart():
     body, (pose, places) = tongs(), pair_of_people()
     result = untangle_motion(body, pose, translation=places)
