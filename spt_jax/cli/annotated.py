@@ -260,22 +260,19 @@ def _size(
     image: str, people: Sequence["Person"], photograph: Path | None, max_bytes: int | None
 ) -> tuple[int, int]:
     """Of the file, else of the photograph, else of an image with the points in its middle."""
-    from spt_jax.keypoints.image_size import guessed_image_size
+    from spt_jax.keypoints.image_size import guessed_image_size, stated_image_size
 
-    stated = {(p.width, p.height) for p in people if p.width and p.height}
-    told = stated.pop() if stated else None
+    stated = stated_image_size(people)
     seen = None if photograph is None else _photograph_size(photograph, max_bytes)
     if seen is not None:
         width, height = seen
-        if told is not None and told != (width, height):
+        if stated is not None and stated != (width, height):
             raise ValueError(
-                f"the photograph of {image} must be {told[0]} by {told[1]} pixels, as the keypoint "
-                f"file says: got {width} by {height} in {photograph}."
+                f"the photograph of {image} must be {stated[0]} by {stated[1]} pixels, as the "
+                f"keypoint file says: got {width} by {height} in {photograph}."
             )
         return width, height
-    if told is not None:
-        return told
-    return guessed_image_size(people)
+    return stated or guessed_image_size(people)
 
 
 def _photograph_size(path: Path, max_bytes: int | None) -> tuple[int, int] | None:

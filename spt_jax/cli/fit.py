@@ -181,10 +181,12 @@ def fit(
         from spt_jax.cli.fitting import fit_everyone, made_from, scenes_of
         from spt_jax.cli.frames import left_out
         from spt_jax.cli.unfinished import UnfinishedRun, manifest_of
+        from spt_jax.io.pose_files import check_joints
 
         with user_errors():
             with warnings_as(notes):
                 model = load_body(body, max_bytes=max_bytes)
+            check_joints(body, model.num_joints)
             orders = {one.person.layout for one in chosen}
             chosen, lost = of_the_body(
                 chosen, {order: keypoint_regressor(model, order).placed for order in orders}

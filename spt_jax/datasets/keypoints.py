@@ -65,8 +65,10 @@ class FitKeypoints:
         from spt_jax._exclusions import as_fold_surface
         from spt_jax.body import load_body
         from spt_jax.fit import SelfIntersection, as_regularizer
+        from spt_jax.io.pose_files import check_joints
 
         self.body_model: BodyModel = load_body(self.body, max_bytes=self.max_bytes)
+        check_joints(self.body, self.body_model.num_joints)
         self.rest_surface = as_fold_surface(self.body_model, self.fold_distance)
         term = as_regularizer(self.regularizer)
         if isinstance(term, SelfIntersection):
@@ -176,12 +178,9 @@ class FitKeypoints:
 def _camera_of(people: Sequence["Person"]) -> "PinholeCamera":
     """One that spans 55 degrees over the longer side of the image of some people."""
     from spt_jax._camera import PinholeCamera
-    from spt_jax.keypoints.image_size import guessed_image_size
+    from spt_jax.keypoints.image_size import guessed_image_size, stated_image_size
 
-    stated = next(((p.width, p.height) for p in people if p.width and p.height), None)
-    if stated is not None:
-        return PinholeCamera.from_field_of_view(float(stated[0]), float(stated[1]))
-    width, height = guessed_image_size(people)
+    width, height = stated_image_size(people) or guessed_image_size(people)
     return PinholeCamera.from_field_of_view(float(width), float(height))
 
 

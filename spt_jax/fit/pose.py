@@ -165,18 +165,18 @@ def _fit_by_cuts(setup: Setup, person: Person, on_step: OnStep | None) -> FitRes
     searched = int(candidates.steps)
     ground = Ground(setup.body, [objective_of(setup.search, person)], term)
 
-    def tell(stage: int, vector: Float[Array, "D"]) -> None:
+    def report(stage: int, vector: Float[Array, "D"]) -> None:
         if on_step is not None:
             posed = _posed(setup.search, setup.body, person, vector)
             on_step(_step(setup.body, stage, searched + ground.looks, posed))
 
-    tell(0, candidates.vectors[0])
+    report(0, candidates.vectors[0])
     stages = PenaltyStages(
         ground,
         np.asarray(term.weights, np.float64),
         float(term.margin),
         setup.max_steps,
-        lambda stage, place: tell(stage, jnp.asarray(place.vector[0], ground.dtype)),
+        lambda stage, place: report(stage, jnp.asarray(place.vector[0], ground.dtype)),
     )
     end = settled(stages, candidates.vectors, free=setup.free and term.folds == "ignore")
     vector, energy, converged, free = candidates.vectors[0], jnp.nan, False, True

@@ -10,5 +10,6 @@ from spt_jax.io.poses.reading import read_motion as read_motion
 from spt_jax.io.poses.track import MotionFile as MotionFile
 from spt_jax.io.poses.track import Track as Track
 from spt_jax.io.poses.whole import JOINT_COUNTS as JOINT_COUNTS
+from spt_jax.io.poses.writing import check_joints as check_joints
 from spt_jax.io.poses.writing import read_poses as read_poses
 from spt_jax.io.poses.writing import write_poses as write_poses

@@ -1,4 +1,4 @@
-"""The size of an image of which only the keypoints of the people in it are known."""
+"""The size of an image that is known by the people in it alone."""
 
 from collections.abc import Sequence
 
@@ -7,6 +7,24 @@ import numpy as np
 from spt_jax.keypoints.entries import Person
 
 _LEAST_SIDE = 64  # pixels
+
+
+def stated_image_size(people: Sequence[Person]) -> tuple[int, int] | None:
+    """Width and height in pixels as the keypoint file states them; None if it does not.
+
+    Args:
+        people: of one image.
+
+    Raises:
+        ValueError: they state different sizes.
+    """
+    stated = sorted({(p.width, p.height) for p in people if p.width and p.height})
+    if len(stated) > 1:
+        raise ValueError(
+            "people of one image must have one size of it: got "
+            f"{' and '.join(f'{w} by {h}' for w, h in stated)} pixels for {people[0].image!r}"
+        )
+    return (int(stated[0][0]), int(stated[0][1])) if stated else None
 
 
 def guessed_image_size(people: Sequence[Person]) -> tuple[int, int]:

@@ -1,14 +1,15 @@
-"""Shapes all of whose intersections are folds, told without their contours.
+"""Shapes all of whose intersections are folds, recognized without their contours.
 
-Most frames of a motion crease elbows and armpits and no more. With folds left out nothing of such a
-shape counts, and to learn so takes far less than to measure it: triangles that are near each other
-at rest need not be looked at, and those are nearly all whose boxes meet. Of a posed body's 54,000
-pairs of triangles some hundreds are left, none of which intersects.
+Most frames of a motion crease elbows and armpits and do nothing else. With folds excluded, the
+whole overlap of such a shape is excluded, and finding that out takes far less time than measuring
+it: triangles that are near each other at rest need not be examined, and nearly all triangles whose
+boxes meet are near. Of a posed body's 54,000 pairs of triangles a few hundred remain, and none of
+them intersects.
 
-What is left out here is left out there, too. Every region of overlap within a connected part is
-bounded by a contour, unless the winding number is not zero all over the part; a region none of
-whose contours counts does not count (`exact.py`). So nothing counts where no pair of triangles that
-intersects does, and the winding number at every part's root is zero.
+The result is the same as that of a measurement. Every region of overlap within a connected part is
+bounded by a contour, unless the winding number is nonzero all over the part; and a region is
+excluded if all of its contours are (`exact.py`). So the included volume is zero if every pair of
+triangles that intersects is excluded and the winding number at every part's root is zero.
 """
 
 from dataclasses import dataclass
@@ -31,19 +32,21 @@ from spt_jax.overlap.triangles.pairs import decided
 from spt_jax.overlap.triangles.predicates import Predicates
 from spt_jax.overlap.triangles.winding import roots_of
 
-# After so many shapes that collide the next one is measured at once: a descent's.
+# After this many shapes in a row that collide, the next one is measured without this check: it is
+# probably another step of the same descent.
 _COLLIDING = 2
 
 
 @dataclass(frozen=True)
 class AtRest:
-    """What the rest surface tells of a layout.
+    """What the rest surface says about a layout.
 
     Attributes:
         layout: of the triangles.
         rest: the surface at rest.
-        asked: whether it was asked for.
-        clusters, groups: which of these are near each other; None: it is not told.
+        asked: whether it has been computed; it is computed when it is asked for a second time.
+        clusters, groups: which of these are near each other; None if the rest surface has other
+            faces.
     """
 
     layout: Layout
@@ -54,7 +57,7 @@ class AtRest:
 
 
 def expect_folds(faces: Int[np.ndarray, "F 3"], count: int, calm: bool) -> None:
-    """Say of the last shape of these faces whether nothing counted: the next one may be like it."""
+    """Record whether the last shape of these faces had no included overlap, as the next may not."""
     manifold = manifold_of(faces, count)
     mesh = prepared(manifold.faces, len(manifold.part))
     mesh.collided = 0 if calm else mesh.collided + 1
@@ -66,16 +69,16 @@ def only_folds(
     exclusions: Exclusions,
     surely: bool = False,
 ) -> bool:
-    """Whether nothing of a surface's overlap counts, as far as pairs of triangles tell.
+    """Whether all of a surface's overlap is excluded, as far as pairs of triangles show.
 
     Args:
         vertices, faces: a mesh that can be measured.
-        exclusions: what does not count.
-        surely: look, even if it takes longer than to measure or is not to be expected.
+        exclusions: what is excluded.
+        surely: check even if that takes longer than measuring, or is not expected to succeed.
 
     Returns:
-        Never true where the volume that counts is above zero. Not always true where it is zero:
-        not where what touches would count, or where holes were closed.
+        Never true if the included volume is above zero. It may be false if that volume is zero:
+        where parts touch, and where holes were closed.
     """
     if exclusions.rest is None:
         return False
@@ -100,22 +103,22 @@ def only_folds(
     for t, u in parts_of_size(pair for some in found for pair in some):
         t, u = straddling(predicates, layout, t, u)
         f, g = (manifold.beside[layout.face[x]] for x in (t, u))
-        # Of those that are left few intersect, and only of these it is asked exactly.
+        # Few of those that remain intersect; only they are decided exactly.
         left = np.flatnonzero(~known.clusters.near_faces(f, g))
         f, g = _intersecting(predicates, mesh.topology, layout, t[left], u[left])
-        if _count(exclusions, manifold, rules, f, g).any():
+        if _included(exclusions, manifold, rules, f, g).any():
             return False
     once = np.ones(manifold.num_parts, np.int64)
     return not roots_of(mesh.topology, manifold, predicates, rules, once)[1].any()
 
 
 def _at_rest(mesh: Prepared, layout: Layout, manifold: Manifold, rest, surely: bool):
-    """What is known of the layout; None where nothing is, and the first time it is asked for."""
+    """What is known of the layout; None if nothing is, and the first time that it is asked for."""
     known = mesh.at_rest
     if known is None or known.layout is not layout or known.rest != rest:
         known = mesh.at_rest = AtRest(layout, rest)
         if not surely:
-            return None  # it takes longer than to measure a mesh
+            return None  # computing it takes longer than measuring one mesh
     if not known.asked:
         filled = np.ones(len(layout.face), bool)
         filled[layout.empty] = False
@@ -128,17 +131,17 @@ def _at_rest(mesh: Prepared, layout: Layout, manifold: Manifold, rest, surely: b
     return known if known.clusters is not None else None
 
 
-def _count(
+def _included(
     exclusions: Exclusions, manifold: Manifold, rules, f: Int[np.ndarray, "N"], g
 ) -> Bool[np.ndarray, "N"]:
-    """Which pairs of faces that intersect count, wholly or by their contour."""
+    """Which pairs of faces that intersect are included, wholly or by their contour."""
     first, second = (manifold.part[manifold.faces[x, 0]] for x in (f, g))
     whole, judged = rules(first, second).T
     at = np.flatnonzero(judged)
-    counts = whole.copy()
+    included = whole.copy()
     beside = manifold.beside
-    counts[at] |= pair_weights(exclusions, beside[f[at]], beside[g[at]]) > 0
-    return counts
+    included[at] |= pair_weights(exclusions, beside[f[at]], beside[g[at]]) > 0
+    return included
 
 
 def _intersecting(predicates: Predicates, topology: Topology, layout: Layout, t, u):

@@ -1,6 +1,6 @@
 """Labels of a mesh some of whose parts are open sheets, which have no inside of their own.
 
-What such a mesh overlaps cannot be measured as a whole, but where its vertices are can be told:
+What such a mesh overlaps cannot be measured as a whole, but the place of each vertex is known:
 those of its solids by what the solids do to each other, as without the sheets, and those of the
 sheets by whether they lie in a solid.
 """
@@ -59,7 +59,7 @@ def labels_beside_sheets(
 ) -> Int8[np.ndarray, "V"]:
     """The labels of a mesh with open sheets; those of the sheets are penetrating or clear.
 
-    What is excluded is so among the solids; sheets are told by where they lie alone.
+    What is excluded is so among the solids; the labels of sheets depend only on where they lie.
 
     Raises:
         Unmeasurable: its solids cannot be measured, or have sheets' vertices that are not finite.

@@ -1,9 +1,9 @@
-"""Sets of triangles all of which are near each other at rest: where nothing but folds can be.
+"""Sets of triangles that are near each other at rest, so that only folds are possible there.
 
 With R_a(s) the distance of the farthest triangle of set a from seed s, no triangle of a is farther
-from one of b than R_a(s) + R_b(s), for any seed. The seed in whose midst either set lies is a good
-one: of a body's sets of 64 triangles that meet in space, four in ten are told to be near, of sets
-of eight more than half of the rest.
+from one of b than R_a(s) + R_b(s), for any seed. The seed nearest to the middle of either set is a
+good one: it shows four in ten of a body's sets of 64 triangles that meet in space to be near, and
+more than half of the remaining sets of eight.
 """
 
 import numpy as np
@@ -82,7 +82,7 @@ class NearSets:
         return self
 
     def near(self, a: Int[np.ndarray, "P"], b: Int[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
-        """Pairs of sets all of whose faces are told to be near each other."""
+        """Pairs of sets all of whose faces are certainly near each other."""
         if self._table is not None:
             return self._table.take(a * len(self.least) + b)
         at_a, at_b = a * self._seeds, b * self._seeds

@@ -40,11 +40,10 @@ def find_contacts(
 ) -> Patches:
     """Patches of different parts of a posed body that are near each other or intersect.
 
-    For each two parts, the triangles that follow one joint each (`body.part_groups`; fingers and
-    toes are one part with their hand or foot), of which
-    vertices are within the distance of each other and are no fold by `body.rest_surface`, there is
-    one pair of patches: the triangles of either part within the distance and 4 cm more of such a
-    vertex.
+    A part is the triangles that follow one joint (`body.part_groups`); fingers and toes belong to
+    their hand or foot. Any two parts that have vertices within the distance of each other, which
+    are no fold by `body.rest_surface`, give one pair of patches: the triangles of either part that
+    are no farther from such a vertex than the distance and 4 cm.
 
     Args:
         body: whose faces, parts and rest surface are meant.
@@ -177,7 +176,7 @@ def held_contacts(
         contacts: "found", or pairs of patches.
         distance: pairs farther apart than that are no contact.
         weight: of the squared distance, per cm^2.
-        rest: what tells folds; None for the body's own.
+        rest: the surface by which folds are recognized; None for the body's own.
         dtype: of the search.
     """
     faces = np.asarray(body.faces, np.int64)

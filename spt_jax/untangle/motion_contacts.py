@@ -49,7 +49,7 @@ def kept_contacts(
         body, frames: the motion.
         contacts: as `as_motion_contacts` returns them.
         distance: what is farther apart is no contact, in metres.
-        rest: of all people, what tells folds.
+        rest: of all people, by which folds are recognized.
         colliding: of each frame, whether it collides.
         reach: frames farther than that from all that collide do not move, and are not looked at.
     """

@@ -1,4 +1,4 @@
-"""How fast a motion changes from frame to frame, by which it is told how smooth is smooth.
+"""How fast a motion changes from frame to frame, which decides how smooth a correction must be.
 
 A correction that comes and goes within a few hundredths of a second shakes a body that gets up
 slowly, and is not seen on one that turns over in the air, whose limbs pass each other in less:

@@ -20,21 +20,19 @@ def fitted(monkeypatch):
 
     def stand_in(body, keypoints, camera, **_):
         given.append(np.asarray(keypoints))
-        # As many joints as SMPL, which the files of poses have; the tongs stay as they are.
-        pose = jnp.zeros((22, 3)).at[0, 0].set(float(keypoints[0, 0]) / 1000)
+        pose = jnp.zeros(body.pose_shape).at[0, 0].set(float(keypoints[0, 0]) / 1000)
         return FitResult(
             pose=pose,
             shape=jnp.zeros(body.num_shape),
             translation=jnp.array([0.0, 0.0, 4.0]),
             vertices=body(jnp.zeros(body.pose_shape)).vertices,
-            joints=jnp.zeros((22, 3)),
+            joints=jnp.zeros(body.pose_shape),
             keypoints=keypoints + jnp.array([[3.0, 0.0]]),
             steps=jnp.array(7),
             terms={"total": jnp.array(1.0)},
             status=RESULTS.successful,
         )
 
-    monkeypatch.setattr("spt_jax.body.load_body", lambda *_, **__: tongs())
     monkeypatch.setattr("spt_jax.fit.fit_pose", stand_in)
     return given
 
@@ -150,3 +148,16 @@ def test_faults_of_the_caller_end_with_two_and_write_nothing(folder, fitted, tmp
         assert run(folder, tmp_path / "out", *words) == 2
     assert run(folder, folder) == 2
     assert not (tmp_path / "out").exists() and not fitted
+
+
+@pytest.mark.parametrize("one_file", [False, True])
+def test_a_body_whose_poses_no_file_holds_is_refused_before_anything_is_fitted(
+    folder, fitted, tmp_path, monkeypatch, capsys, one_file
+):
+    monkeypatch.setattr("spt_jax.body.load_body", lambda *_, **__: tongs())
+    out = tmp_path / "out"
+    given = folder / "a" / "same.json" if one_file else folder
+    words = ["fit", str(given), "--out", str(out), "--quiet"]
+    assert main(words if one_file else [*words, "--processes", "0"]) == 2
+    assert "body must have 22, 24, 52 or 55 joints, whose poses can be" in capsys.readouterr().err
+    assert fitted == [] and results_in(out) == {}

@@ -57,7 +57,7 @@ def descend(look: Look, place: Place, cuts: Cuts, weight: float, margin: float, 
     for _ in range(most):
         proximal = np.broadcast_to((_STIFFNESS + held) * eye, place.squares.curvature.shape)
         step, gain = cuts.step(place.vector, place.squares, proximal, weight)
-        # A step that is held promises little: only a free one tells that nothing is left.
+        # A held step always promises little; only a free one shows that nothing is left to gain.
         little = _ATOL + _RTOL * total
         if held <= _HELD and not gain > little:
             return Ended(place, True)

@@ -44,7 +44,7 @@ class Tried(NamedTuple):
     Attributes:
         place: measured with the term's own margin.
         converged: whether the descent that ended there had nothing left to gain.
-        pairs: of faces that intersect and count; a very large number if that cannot be told.
+        pairs: of included faces that intersect; a very large number if that cannot be measured.
         volume: of the overlap, in m^3.
     """
 
@@ -87,7 +87,7 @@ class Stages:
         self.on_stage = on_stage
 
     def quietly(self) -> "Stages":
-        """The same, of which nobody is told."""
+        """The same without the callback."""
         return Stages(self.ground, np.array(self.weights), self.margin, self.most, lambda *_: None)
 
     @property

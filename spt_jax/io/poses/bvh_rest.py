@@ -195,7 +195,7 @@ def _places(joints: Sequence[Joint], axes: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _facing(places: np.ndarray, found: Mapping[str, int], *, snapped: bool) -> np.ndarray:
-    """Which way is left, up and forward, as columns, told by hips and shoulders.
+    """Which way is left, up and forward, as columns, from the hips and shoulders.
 
     Args:
         places: of all joints.

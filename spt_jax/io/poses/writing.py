@@ -12,6 +12,7 @@ from spt_jax.files.outputs import atomic_write
 from spt_jax.io.poses.containers import Container
 from spt_jax.io.poses.reading import open_poses, read_motion
 from spt_jax.io.poses.track import Track
+from spt_jax.io.poses.whole import JOINT_COUNTS
 
 
 def read_poses(path: str | os.PathLike[str], *, max_bytes: int | None = None) -> Track:
@@ -29,6 +30,24 @@ def read_poses(path: str | os.PathLike[str], *, max_bytes: int | None = None) ->
             "load_poses returns them all"
         )
     return tracks[0]
+
+
+def check_joints(body: str, count: int) -> None:
+    """Refuse a body whose poses `write_poses` could not write, before work is spent on them.
+
+    Args:
+        body: its name or file.
+        count: of its joints.
+
+    Raises:
+        ValueError: pose files hold no poses of so many joints.
+    """
+    if count not in JOINT_COUNTS:
+        raise ValueError(
+            f"body must have {', '.join(map(str, JOINT_COUNTS[:-1]))} or {JOINT_COUNTS[-1]} "
+            f"joints, whose poses can be written: got {body!r} with {count}; in Python, fit_pose "
+            "takes it."
+        )
 
 
 def write_poses(

@@ -31,7 +31,7 @@ _ROUNDING = 1e-12
 # How far directions lean to the normal, along which vertices are pushed. Heights above a flat side
 # that was turned in float32 are 1e-6 of its triangles' size: they allow for much more.
 _TILT = 8.0
-# Pairs that are looked at to tell whether corners in one place are common.
+# Pairs that are sampled to estimate how often corners lie in one place.
 _SAMPLE, _COMMON = 128, 0.05
 
 
