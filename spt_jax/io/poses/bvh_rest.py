@@ -247,11 +247,8 @@ def _said(kind: str, hanging: float, facing: np.ndarray) -> str:
     if hanging:
         said.append(f"the skeleton's rest pose is turned into SMPL's T, by {hanging:.0f} degrees")
     if not np.array_equal(facing, np.eye(3)):
-        names = ("x", "y", "z")
-        ways = [
-            ("-" if c[i] < 0 else "") + names[i] for c in facing.T for i in [np.abs(c).argmax()]
-        ]
-        said.append(f"the skeleton rests with {ways[1]} up and {ways[2]} in front")
+        _, up, front = map(_axis, facing.T)
+        said.append(f"the skeleton rests with {up} up and {front} in front")
     return "; ".join(said)
 
 
