@@ -15,7 +15,7 @@ class Config:
     Attributes:
         processes: how many helper processes may share a batch of meshes on the host: 0 (the
             default), a number, or "auto" for one less than there are cores, at most 7. Two cores
-            then measure a batch 1.7 times as fast as one. They are started once batches have taken
+            then measure a batch 1.6 times as fast as one. They are started once batches have taken
             half a second, take 100 MB each (300 with a rest surface), and end with this process; a
             loss of one mesh at a time gains nothing from them.
         result_cache_bytes: how much memory the results of the last meshes may take, 64 MB by
