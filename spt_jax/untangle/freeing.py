@@ -5,22 +5,22 @@ volume is pushed along the gradient of that volume, a Newton step towards none. 
 is a curve where two sheets just pass through each other, and is moved so that the curve gets
 shorter. Both are spread smoothly over the surface around (`spread.py`).
 
-Every step is measured: what the search returns is the best of all the places where it has been,
-and what it was given where none of them is better in every respect.
+Every step is measured (`places.py`): what the search returns is the best of all the places where it
+has been, and what it was given where none of them is better in every respect. Where nothing is left
+to part, the displacements are made as small as they can be (`tightening.py`).
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from spt_jax._steps import OnStep, Step
-from spt_jax.overlap.arrays.vectors import area_normals, dot
-from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable, measure
-from spt_jax.overlap.triangles.pairs import EdgeIntersections
+from spt_jax.overlap.measure import Sampling, measure
 from spt_jax.untangle.contours import contour_forces
-from spt_jax.untangle.spread import Spread, Surface
+from spt_jax.untangle.places import Place, Places
+from spt_jax.untangle.spread import Spread, Surface, newton_step, sized_step
+from spt_jax.untangle.tightening import tighten
 
 # How far a push spreads, in edges, by the root of the number of vertices in the overlap: wide
 # enough that the middle of a deep overlap and its contour move together. Of 0.17, 0.25 and 0.5, the
@@ -28,7 +28,6 @@ from spt_jax.untangle.spread import Spread, Surface
 # more often need a second attempt, in which it is doubled.
 _REACH = 0.2
 _SHORTEST_REACH, _LONGEST_REACH = 4.0, 96.0
-
 # What moves, in multiples of the reach: beyond, a push has faded to under 2 %.
 _PATCH = 3.0
 
@@ -48,82 +47,11 @@ _PATIENCE = 12
 
 # No vertex goes farther than this many times the size of its connected part.
 _FARTHEST = 1.0
-# A part is no longer itself where more of its triangles are turned over, or its area has grown by
-# more: of 40 posed bodies at most 0.2 % are turned over, and none grows.
-_MOST_FLIPPED, _MOST_AREA = 0.1, 1.5
 
 # What parts that are pushed apart as they are keep between them, in their size, and in how many
 # steps that must be done.
 _GAP = 1e-3
 _RIGID_STEPS = 12
-
-# At the end: halvings of the way back, and vertices that moved by less than such a share of the
-# largest displacement around them are tried where they were.
-_TIGHTENINGS = 4
-_FADED = (0.1, 0.03)
-
-# Depth, against the largest coordinate, up to which triangles touch in double precision.
-_TOUCHING = 8.0 * float(np.finfo(np.float64).eps)
-# Of a volume, in rounding.
-_EQUAL = 1e-9
-
-_EXACT = Sampling(None, ((0.0, 0.0, -1.0),))
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Vertices that the search came by, measured.
-
-    Attributes:
-        vertices: at values that the dtype asked for can hold.
-        found: what was measured of them, exactly.
-        intersections: of edges through triangles that are to go; in the numbering of
-            `found.surface`.
-        left: pairs of triangles to be separated. More than those counted as intersecting: in
-            single precision, also those that are deeper in each other than rounding alone explains.
-        inverted: connected parts whose volume changed its sign.
-    """
-
-    vertices: Float[np.ndarray, "V 3"]
-    found: Measurement
-    intersections: EdgeIntersections
-    left: int
-    inverted: int
-
-    @property
-    def pairs(self) -> int:
-        """Pairs of triangles that intersect; contact is none."""
-        return self.found.total_intersecting_pairs
-
-    @cached_property
-    def volume(self) -> float:
-        """The overlap volume, exact."""
-        return self.found.overlap.volume
-
-    @cached_property
-    def labels(self) -> Int[np.ndarray, "V"]:
-        """The labels of the vertices."""
-        return self.found.labels("vertex")
-
-    @property
-    def rank(self) -> tuple[int, int, float]:
-        """Sorts places, the best first."""
-        return self.pairs, self.left, self.volume
-
-    @cached_property
-    def crossed(self) -> Bool[np.ndarray, "V"]:
-        """Vertices of edges and triangles that are to be parted."""
-        crossed = np.zeros(len(self.vertices), bool)
-        for vertices in self.ends:
-            crossed[vertices] = True
-        return crossed
-
-    @property
-    def ends(self) -> tuple[Int[np.ndarray, "K 2"], Int[np.ndarray, "K 3"]]:
-        """Of the intersections the edges and the triangles, by the vertices given."""
-        manifold = self.found.surface.manifold
-        corners = manifold.faces[self.intersections.face]
-        return manifold.origin[self.intersections.edge], manifold.origin[corners]
 
 
 @dataclass(frozen=True)
@@ -204,7 +132,7 @@ def free_vertices(
         found = search.part(attempts)
         best = found if found.rank < best.rank else best
     if not best.left:
-        best = search.tighten(best)
+        best = tighten(search.places, best)
     return Freed(best, start, search.steps, search.ran_out, search.diverged)
 
 
@@ -218,20 +146,12 @@ class _Search:
         fixed: np.ndarray | None = None,
     ):
         self.surface, self.sampling, self.on_step = surface, sampling, on_step
-        self.dtype = vertices.dtype
         self.steps = 0
         self.ran_out = self.diverged = False
-        given = vertices.astype(np.float64)
-        found = self._measured(given)
-        self._sense = surface.part_senses(given)
-        self._size = surface.part_sizes(given)
-        self._normals = area_normals(given, surface.faces)
-        self._areas = surface.part_sums(np.linalg.norm(self._normals, axis=1))
-        # What touches at the start may go on doing so.
-        pairs, listed = self._listed(found)
-        self._touching = self._keys(pairs[listed & ~found.surface.proper])
-        self.start = self._place(found)
-        self.edge_length = surface.edge_length(given)
+        self.places = Places(surface, vertices)
+        self.start = self.places.start
+        self._size = surface.part_sizes(self.start.vertices)
+        self.edge_length = surface.edge_length(self.start.vertices)
         parts = np.unique(surface.part[self.start.crossed])
         self.may_move = np.isin(surface.part, parts)
         if fixed is not None:
@@ -239,67 +159,6 @@ class _Search:
             parts = np.setdiff1d(parts, surface.part[fixed])
         # Of two parts that intersect, this one gives way: the smaller one of those that may.
         self._weight = np.where(np.isin(np.arange(surface.num_parts), parts), self._size, np.inf)
-
-    def _listed(self, found: Measurement):
-        """The faces given of all contours, and which contours have no fan."""
-        faces = found.surface.manifold.kept[found.surface.contours.pair]
-        return faces, (faces >= 0).all(axis=1)
-
-    def _keys(self, pairs: Int[np.ndarray, "P 2"]) -> Int[np.ndarray, "P"]:
-        return pairs.min(axis=1) * len(self.surface.faces) + pairs.max(axis=1)
-
-    def look(self, vertices: Float[np.ndarray, "V 3"]) -> Place:
-        """The place as it will be in the caller's dtype.
-
-        Raises:
-            Unmeasurable: there is nothing to measure.
-        """
-        with np.errstate(over="ignore"):  # which cannot be measured
-            at = vertices.astype(self.dtype).astype(np.float64)
-        return self._place(self._measured(at))
-
-    def _measured(self, vertices: Float[np.ndarray, "V 3"]) -> Measurement:
-        rounding = float(np.finfo(self.dtype).eps)
-        return measure(vertices, self.surface.faces, _EXACT, rounding=rounding)
-
-    def _place(self, found: Measurement) -> Place:
-        surface = found.surface
-        pairs, listed = self._listed(found)
-        close = surface.contours.proper(surface.points, surface.manifold.faces, _TOUCHING)
-        close &= ~np.isin(self._keys(pairs), self._touching)
-        wanted = listed & (surface.proper | close)
-        ends = surface.contours.end[wanted]
-        kept = np.zeros(len(surface.intersections.face), bool)
-        kept[ends[ends >= 0]] = True
-        turned = self.surface.part_senses(found.vertices) * self._sense < 0
-        return Place(
-            found.vertices,
-            found,
-            surface.intersections.only(kept),
-            int(np.count_nonzero(wanted)),
-            int(np.count_nonzero(turned)),
-        )
-
-    def is_no_worse(self, place: Place) -> bool:
-        """Whether nothing has come that was not there at the start."""
-        start = self.start
-        if place.inverted or place.pairs > start.pairs:
-            return False
-        if place.volume > (1 + _EQUAL) * start.volume or self.is_crumpled(place):
-            return False
-        # What no longer intersects may have been pushed into another part whole.
-        moved = (place.vertices != start.vertices).any(axis=1)
-        return bool(place.pairs) or not (place.labels[moved] != 0).any()
-
-    def is_crumpled(self, place: Place) -> bool:
-        """Whether some part no longer is what it was."""
-        normals = area_normals(place.vertices, self.surface.faces)
-        area = self.surface.part_sums(np.linalg.norm(normals, axis=1))
-        flipped = self.surface.part_sums(dot(normals, self._normals) < 0)
-        every = self.surface.part_sums(np.ones(len(normals)))
-        return bool(
-            (flipped > _MOST_FLIPPED * every).any() or (area > _MOST_AREA * self._areas).any()
-        )
 
     def push(self, place: Place) -> Float[np.ndarray, "V 3"]:
         """The gradient of the overlap volume."""
@@ -346,7 +205,7 @@ class _Search:
 
     def report(self, attempt: int, place: Place) -> None:
         """Call `on_step` with a place."""
-        vertices = place.vertices.astype(self.dtype)
+        vertices = place.vertices.astype(self.places.dtype)
         self.on_step(Step(attempt, self.steps, vertices, None, lambda: (place.volume, place.pairs)))
 
     def descend(
@@ -362,7 +221,7 @@ class _Search:
             if not place.left or idle >= _PATIENCE:
                 break
             self.steps += 1
-            ahead = self.there(self.bounded(place.vertices + self.move(place, wide, narrow)))
+            ahead = self.places.there(self.bounded(place.vertices + self.move(place, wide, narrow)))
             if ahead is None:
                 self.diverged = True
                 break
@@ -370,7 +229,7 @@ class _Search:
             idle += 1
             if place.left < least.left:
                 least, idle = place, 0
-            if place.rank < best.rank and self.is_no_worse(place):
+            if place.rank < best.rank and self.places.is_no_worse(place):
                 best = place
         self.ran_out = bool(place.left) and idle < _PATIENCE
         return best, least
@@ -404,7 +263,7 @@ class _Search:
                 pushed.append((members, _OVERSTEP * volume))
             else:
                 pulled.append((members, _CONTOUR_STEP * edge))
-        return _newton_step(wide, push, pushed) + _sized_step(narrow, contour, pulled)
+        return newton_step(wide, push, pushed) + sized_step(narrow, contour, pulled)
 
     def part(self, attempt: int) -> Place:
         """The best place on the way of connected parts that push each other apart as they are.
@@ -432,101 +291,10 @@ class _Search:
                 way, axis = np.unravel_index(np.abs(ways).argmin(), ways.shape)
                 shift[mover, axis] += ways[way, axis] + np.copysign(gap, ways[way, axis])
             self.steps += 1
-            moved = place.vertices + shift[self.surface.part]
-            ahead = self.there(self.bounded(moved))
+            ahead = self.places.there(self.bounded(place.vertices + shift[self.surface.part]))
             if ahead is None:
                 break
             place = ahead
-            if place.rank < best.rank and self.is_no_worse(place):
+            if place.rank < best.rank and self.places.is_no_worse(place):
                 best = place
         return best
-
-    def tighten(self, place: Place) -> Place:
-        """A place where nothing is left, pulled back towards the start while that stays so."""
-        start, shift = self.start.vertices, place.vertices - self.start.vertices
-        edge, corners = self.start.ends
-        moved = (shift != 0).any(axis=1)
-        groups = self.surface.groups(moved | self.start.crossed, edge[:, 0], corners[:, 0])
-        count = len(groups)
-        name = np.full(len(moved), count)
-        for k, members in enumerate(groups):
-            name[members] = k
-        low, high = np.zeros(count + 1), np.ones(count + 1)
-        # Parts that something was pushed into, and that then moved, may not have to.
-        without = np.ones(count + 1)
-        without[:count] = [self.start.crossed[members].any() for members in groups]
-        if (without < 1).any() and self._fits(self.there(start + without[name][:, None] * shift)):
-            high = without
-        for _ in range(_TIGHTENINGS):
-            middle = 0.5 * (low + high)
-            there = self.there(start + middle[name][:, None] * shift)
-            stuck = np.ones(count + 1, bool)
-            if there is not None and (self._fits(there) or there.left):
-                stuck = np.zeros(count + 1, bool)
-                stuck[name[there.crossed]] = True
-            low, high = np.where(stuck, middle, low), np.where(stuck, high, middle)
-        back = self.there(start + high[name][:, None] * shift)
-        if back is not None and self._fits(back):
-            place = back
-        return self.narrow(place, groups)
-
-    def narrow(self, place: Place, groups: list[Int[np.ndarray, "_"]]) -> Place:
-        """The same without the vertices that moved least, where that does."""
-        start = self.start.vertices
-        shift = place.vertices - start
-        size = np.linalg.norm(shift, axis=1)
-        largest = np.zeros(len(size))
-        for members in groups:
-            largest[members] = size[members].max()
-        for share in _FADED:
-            # Continuous: the largest displacement stays, those of this share of it vanish.
-            rest = np.maximum(size - share * largest, 0.0) / (1.0 - share)
-            scale = rest / np.where(size > 0, size, 1.0)
-            there = self.there(start + scale[:, None] * shift)
-            if there is not None and self._fits(there):
-                return there
-        return place
-
-    def there(self, vertices: Float[np.ndarray, "V 3"]) -> Place | None:
-        """The place, or None where there is nothing to measure."""
-        try:
-            return self.look(vertices)
-        except Unmeasurable:
-            return None
-
-    def _fits(self, place: Place | None) -> bool:
-        return place is not None and not place.left and self.is_no_worse(place)
-
-
-def _newton_step(
-    spread: Spread, push: Float[np.ndarray, "V 3"], regions: list[tuple[np.ndarray, float]]
-) -> Float[np.ndarray, "V 3"]:
-    """The smallest displacement, in the sense of `spread`, that takes so much volume away."""
-    forces = np.zeros(push.shape)
-    if not regions:
-        return forces
-    size = {}
-    for k, (members, _) in enumerate(regions):
-        size[k] = np.linalg.norm(push[members])
-        forces[members] = push[members] / size[k]
-    moved = spread(forces)
-    for k, (members, volume) in enumerate(regions):
-        gain = size[k] * np.sum(forces[members] * moved[members])
-        forces[members] *= -volume / gain if gain > 0 else 0.0
-    return spread(forces)
-
-
-def _sized_step(
-    spread: Spread, pull: Float[np.ndarray, "V 3"], regions: list[tuple[np.ndarray, float]]
-) -> Float[np.ndarray, "V 3"]:
-    """A displacement along the forces, as large as asked for in each region."""
-    forces = np.zeros(pull.shape)
-    if not regions:
-        return forces
-    for members, _ in regions:
-        forces[members] = pull[members]
-    moved = spread(forces)
-    for members, size in regions:
-        largest = np.linalg.norm(moved[members], axis=1).max()
-        forces[members] *= size / largest if largest > 0 else 0.0
-    return spread(forces)

@@ -15,8 +15,9 @@ from spt_jax.overlap.arrays.vectors import area_normals, dot
 from spt_jax.overlap.measure import Sampling
 from spt_jax.overlap.rays.beam import Rays
 from spt_jax.overlap.triangles.manifold import manifold_of
-from spt_jax.untangle.freeing import Freed, Place, free_vertices
+from spt_jax.untangle.freeing import Freed, free_vertices
 from spt_jax.untangle.garment import SheetPlace, free_sheet
+from spt_jax.untangle.places import Place
 from spt_jax.untangle.spread import Surface
 
 

@@ -2,7 +2,7 @@
 
 NumPy and SciPy only. All lengths are counted in edges, so that a mesh's fine parts (fingers) and
 coarse parts (trunk) are treated alike, and so that a Laplacian of bad triangles stays well
-conditioned.
+conditioned. `newton_step` and `sized_step` scale the displacements of several regions at once.
 """
 
 from dataclasses import dataclass
@@ -168,3 +168,37 @@ class Spread:
         if len(self.patch):
             moved[self.patch] = self._factor.solve(np.ascontiguousarray(forces[self.patch]))
         return moved
+
+
+def newton_step(
+    spread: Spread, push: Float[np.ndarray, "V 3"], regions: list[tuple[np.ndarray, float]]
+) -> Float[np.ndarray, "V 3"]:
+    """The smallest displacement, in the sense of `spread`, that takes so much volume away."""
+    forces = np.zeros(push.shape)
+    if not regions:
+        return forces
+    size = {}
+    for k, (members, _) in enumerate(regions):
+        size[k] = np.linalg.norm(push[members])
+        forces[members] = push[members] / size[k]
+    moved = spread(forces)
+    for k, (members, volume) in enumerate(regions):
+        gain = size[k] * np.sum(forces[members] * moved[members])
+        forces[members] *= -volume / gain if gain > 0 else 0.0
+    return spread(forces)
+
+
+def sized_step(
+    spread: Spread, pull: Float[np.ndarray, "V 3"], regions: list[tuple[np.ndarray, float]]
+) -> Float[np.ndarray, "V 3"]:
+    """A displacement along the forces, as large as asked for in each region."""
+    forces = np.zeros(pull.shape)
+    if not regions:
+        return forces
+    for members, _ in regions:
+        forces[members] = pull[members]
+    moved = spread(forces)
+    for members, size in regions:
+        largest = np.linalg.norm(moved[members], axis=1).max()
+        forces[members] *= size / largest if largest > 0 else 0.0
+    return spread(forces)

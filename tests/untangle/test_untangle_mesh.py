@@ -30,6 +30,7 @@ from spt_jax.overlap.triangles.pairs import edge_intersections
 from spt_jax.untangle.contours import contour_forces
 from spt_jax.untangle.freeing import _Search
 from spt_jax.untangle.mesh import untangle_mesh
+from spt_jax.untangle.places import Places
 from spt_jax.untangle.spread import Spread, Surface
 
 
@@ -270,19 +271,19 @@ def test_thin_plates_keep_their_sides():
 
 def test_parts_turned_over_or_pushed_inside_are_seen(rng):
     vertices, faces = two_spheres(1.5, 1)
-    search = _Search(Surface(faces, len(vertices)), vertices, sampling(None), lambda *_: None)
+    places = Places(Surface(faces, len(vertices)), vertices)
     second = np.arange(len(vertices)) >= len(vertices) // 2
     shift = np.where(second[:, None], [[3.0, 0.0, 0.0]], 0.0)
-    apart = search.look(vertices + shift)
-    assert apart.left == apart.inverted == 0 and search.is_no_worse(apart)
+    apart = places.look(vertices + shift)
+    assert apart.left == apart.inverted == 0 and places.is_no_worse(apart)
     mirrored = vertices * np.where(second[:, None], [[-1.0, 1.0, 1.0]], 1.0) + 2 * shift
-    turned_over = search.look(mirrored)
-    assert turned_over.inverted == 1 and not search.is_no_worse(turned_over)
+    turned_over = places.look(mirrored)
+    assert turned_over.inverted == 1 and not places.is_no_worse(turned_over)
     small = np.where(second[:, None], 0.1 * (vertices - [1.5, 0.0, 0.0]), vertices)
-    inside = search.look(small)
-    assert inside.left == 0 and not search.is_no_worse(inside)
+    inside = places.look(small)
+    assert inside.left == 0 and not places.is_no_worse(inside)
     flat = np.where(second[:, None], vertices * [1.0, 1.0, 12.0] + shift, vertices)
-    assert search.is_crumpled(search.look(flat)) and not search.is_crumpled(apart)
+    assert places.is_crumpled(places.look(flat)) and not places.is_crumpled(apart)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
