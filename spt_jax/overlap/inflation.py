@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from spt_jax.overlap.arrays.columns import cross
 from spt_jax.overlap.arrays.vectors import dot
 from spt_jax.overlap.triangles.faces_cache import FacesCache
-from spt_jax.overlap.triangles.pair_boxes import cross
 
 # A vertex moves at most this many distances. A box's corner needs 1.73, a cone of 39 degrees at its
 # tip needs 3; the needles beyond would shoot far out of the mesh and into its other parts.

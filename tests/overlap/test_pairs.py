@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers import body_faces, box, join, moved, posed_bodies, random_rotation, sphere
 
+from spt_jax.overlap.arrays import pieces
 from spt_jax.overlap.triangles import pair_boxes, pair_layout
 from spt_jax.overlap.triangles.contours import find_contours
 from spt_jax.overlap.triangles.manifold import manifold_of
@@ -236,7 +237,7 @@ def test_earlier_shapes_and_threads_change_nothing(rng):
 def test_small_parts_give_what_large_ones_do(rng, monkeypatch):
     mesh = noisy(sphere(subdivisions=3), 0.04, rng)
     expected = found_in(mesh)
-    monkeypatch.setattr(pair_boxes, "_CHUNK", 100)
+    monkeypatch.setattr(pieces, "_CHUNK", 100)
     assert found_in(mesh) == expected != set()
 
 

@@ -7,7 +7,7 @@ from helpers import bent_tube, box, inverted, join, moved, random_rotation
 
 from spt_jax.overlap.exclusions import NOTHING
 from spt_jax.overlap.surface import ExactSurface
-from spt_jax.overlap.triangles import pair_boxes, pair_layout
+from spt_jax.overlap.triangles import box_words, pair_boxes, pair_layout
 from spt_jax.overlap.triangles.pair_layout import CLUSTER
 from spt_jax.rest import paths
 from spt_jax.rest.surface import RestSurface
@@ -90,7 +90,7 @@ def test_pairs_whose_boxes_meet(solids):
     found = [frozenset(pair) for pair in layout.face[slots].tolist()]
     assert len(found) == len(set(found))
     meet = reference.near_pairs((vertices, faces))
-    step = np.ptp(vertices, axis=0).max() / pair_boxes.STEPS
+    step = np.ptp(vertices, axis=0).max() / box_words.STEPS
     assert meet <= set(found) <= reference.near_pairs((vertices, faces), slack=3 * step)
     assert len(meet) > 100
 

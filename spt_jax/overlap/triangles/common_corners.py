@@ -21,8 +21,8 @@ is, and pairs of which nothing can be said are left to the signs.
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.arrays.columns import cross
 from spt_jax.overlap.triangles.determinants import largest_of
-from spt_jax.overlap.triangles.pair_boxes import cross
 from spt_jax.overlap.triangles.pair_planes import dot
 from spt_jax.overlap.triangles.predicates import Predicates
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.arrays.columns import cross
 from spt_jax.overlap.arrays.ranges import unique
-from spt_jax.overlap.triangles.pair_boxes import Shape, cross
+from spt_jax.overlap.triangles.box_words import Shape
 from spt_jax.overlap.triangles.pair_layout import Layout
 from spt_jax.overlap.triangles.pair_planes import dot, heights
 

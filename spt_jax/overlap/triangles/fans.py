@@ -3,9 +3,11 @@
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from spt_jax.overlap.arrays.columns import cross
+from spt_jax.overlap.arrays.pieces import parts
 from spt_jax.overlap.arrays.ranges import spread
+from spt_jax.overlap.triangles.box_words import Shape
 from spt_jax.overlap.triangles.determinants import BOUND, LEAST, largest_of
-from spt_jax.overlap.triangles.pair_boxes import Shape, cross, parts
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology
 from spt_jax.overlap.triangles.pair_planes import ROUNDING
 

@@ -3,7 +3,9 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from spt_jax.overlap.triangles.pair_boxes import STEPS, Shape, cross, pieces
+from spt_jax.overlap.arrays.columns import cross
+from spt_jax.overlap.arrays.pieces import pieces
+from spt_jax.overlap.triangles.box_words import STEPS, Shape
 
 # What rounding may take from a distance of points none of whose coordinates is above one.
 _ROUNDED = 1e-12

@@ -17,22 +17,18 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Bool, Int
 
+from spt_jax.overlap.arrays.pieces import parts_of_size, pieces
+from spt_jax.overlap.triangles.box_words import STEPS, Boxes, Shape, touching_share
 from spt_jax.overlap.triangles.common_corners import apart, are_common
 from spt_jax.overlap.triangles.contacts import Contacts, contacts_of
 from spt_jax.overlap.triangles.fans import around_vertices, facing
 from spt_jax.overlap.triangles.pair_boxes import (
-    STEPS,
-    Boxes,
     Pairs,
-    Shape,
     across_groups,
     boxes_of,
     near_groups,
     near_pairs,
-    parts_of_size,
-    pieces,
     ranked,
-    touching_share,
     within_clusters,
 )
 from spt_jax.overlap.triangles.pair_layout import Layout, Prepared

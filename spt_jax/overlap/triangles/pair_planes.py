@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from spt_jax.overlap.triangles.pair_boxes import Shape, cross
+from spt_jax.overlap.arrays.columns import cross
+from spt_jax.overlap.triangles.box_words import Shape
 from spt_jax.overlap.triangles.pair_layout import Layout
 
 # Relative to the size of what is multiplied, far above float64's rounding.

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from spt_jax.overlap.arrays.pieces import concatenate
 from spt_jax.overlap.arrays.ranges import unique
 from spt_jax.overlap.triangles.contacts import Contacts
 from spt_jax.overlap.triangles.near_triangles import NearTriangles
-from spt_jax.overlap.triangles.pair_boxes import concatenate
 from spt_jax.overlap.triangles.pair_layout import Layout, Topology, prepared
 from spt_jax.overlap.triangles.predicates import Predicates
 

@@ -24,22 +24,12 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
+from spt_jax.overlap.arrays.pieces import concatenate
 from spt_jax.overlap.arrays.ranges import unique
+from spt_jax.overlap.triangles.box_words import GUARDS, STEPS, Boxes, Shape, around, joined, word
 from spt_jax.overlap.triangles.fans import facing
 from spt_jax.overlap.triangles.gaps import gaps
-from spt_jax.overlap.triangles.pair_boxes import (
-    GUARDS,
-    STEPS,
-    Boxes,
-    Shape,
-    across_groups,
-    around,
-    concatenate,
-    joined,
-    meeting_boxes,
-    within_clusters,
-    word,
-)
+from spt_jax.overlap.triangles.pair_boxes import across_groups, meeting_boxes, within_clusters
 from spt_jax.overlap.triangles.pair_layout import CLUSTER, Layout, Prepared, Topology
 
 _GROUP = CLUSTER**2
