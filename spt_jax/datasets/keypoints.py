@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spt_jax.datasets.arguments import as_body_key, as_fold_distance_given
 from spt_jax.datasets.figures import file_figures, overlap_figures
 from spt_jax.datasets.items.work import Report, UnknownFileError
-from spt_jax.datasets.motions import as_body_key, as_fold_distance_given
 from spt_jax.datasets.runs import run
 from spt_jax.datasets.summary import Summary
 from spt_jax.keypoints.mistakes import Robust, robust_scale

@@ -11,7 +11,7 @@ from spt_jax.datasets.items.store import Store
 from spt_jax.files.outputs import atomic_write, ensure_folder
 
 if TYPE_CHECKING:
-    from spt_jax.datasets.motions import MeasureMotions
+    from spt_jax.datasets.motion_tasks import MeasureMotions
 
 Row = Mapping[str, Any]
 

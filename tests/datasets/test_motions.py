@@ -13,7 +13,7 @@ from helpers_penalty import compiled_names
 from spt_jax import datasets, load_body
 from spt_jax.body.poses import SMPL_LAYOUTS
 from spt_jax.cli.main import main
-from spt_jax.datasets.motions import CleanMotions, MeasureMotions
+from spt_jax.datasets.motion_tasks import CleanMotions, MeasureMotions
 from spt_jax.io import load_poses
 from spt_jax.metrics import motion_overlap
 from spt_jax.untangle.motion_input import up_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spt_jax.datasets.items.inventory import take_inventory
-from spt_jax.datasets.motions import MeasureMotions
+from spt_jax.datasets.motion_tasks import MeasureMotions
 from spt_jax.io import load_poses, open_poses
 
 
