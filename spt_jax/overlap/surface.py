@@ -21,9 +21,10 @@ from spt_jax.overlap.triangles.contours import Contours, find_contours
 from spt_jax.overlap.triangles.manifold import Manifold, manifold_of
 from spt_jax.overlap.triangles.pair_layout import Topology, prepared
 from spt_jax.overlap.triangles.pairs import EdgeIntersections, find_intersections
+from spt_jax.overlap.triangles.part_roots import enclosing_parts
 from spt_jax.overlap.triangles.predicates import Predicates
 from spt_jax.overlap.triangles.regions import connected_regions
-from spt_jax.overlap.triangles.winding import Ends, enclosing_parts, labels_of, winding_numbers
+from spt_jax.overlap.triangles.winding import Ends, labels_of, winding_numbers
 
 # Vertices that are moved by this many units in the last place of the largest coordinate, as turning
 # a mesh moves them, neither enter a triangle that they touch nor leave it.

@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull
 from spt_jax.overlap.exact import ExactOverlap
 from spt_jax.overlap.measure import Unmeasurable, measure
 from spt_jax.overlap.surface import ExactSurface
-from spt_jax.overlap.triangles import winding
+from spt_jax.overlap.triangles import part_roots
 
 FRAMES = ["roll/0053", "crawl/0092", "dance_a/0068"]
 
@@ -324,6 +324,6 @@ def test_columns_of_rays_miss_no_triangle(rng, ranks):
         kept = (z.min(axis=1) <= rays[2, ray]) & (z.max(axis=1) >= rays[2, ray])
         return sorted(zip(ray[kept].tolist(), face[kept].tolist(), strict=True))
 
-    assert meeting(winding._columns(rays, points, faces)) == meeting(
-        winding._rows(rays, points, faces)
+    assert meeting(part_roots._columns(rays, points, faces)) == meeting(
+        part_roots._rows(rays, points, faces)
     )
