@@ -31,7 +31,8 @@ from spt_jax.files.limits import (
     parse_json,
     read_bytes,
 )
-from spt_jax.files.pickles import RefusedPickleError, StandIn, plain
+from spt_jax.files.pickles import RefusedPickleError
+from spt_jax.files.stand_ins import StandIn, plain
 from spt_jax.io.poses.pickling import as_pickle, as_torch_archive
 from spt_jax.io.poses.unpickling import as_storage, check_total, read_legacy_torch, unpickled
 

@@ -18,14 +18,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from spt_jax.files.limits import MAX_BYTES, TooLargeError, check_bytes
-from spt_jax.files.pickles import (
-    ADMITTED,
-    Admitted,
-    GuardedUnpickler,
-    NumpyArrayName,
-    RefusedPickleError,
-    StandIn,
-)
+from spt_jax.files.pickles import GuardedUnpickler, RefusedPickleError
+from spt_jax.files.stand_ins import ADMITTED, Admitted, NumpyArrayName, StandIn
 
 STORAGES = {
     "FloatStorage": "<f4",
