@@ -8,7 +8,7 @@ from spt_jax.keypoints.layout import Layout as Layout
 from spt_jax.keypoints.layout import edge_side as edge_side
 from spt_jax.keypoints.layouts import LAYOUTS as LAYOUTS
 from spt_jax.keypoints.layouts import as_layout as as_layout
-from spt_jax.keypoints.regressor import AnyLayout as AnyLayout
+from spt_jax.keypoints.making_regressors import AnyLayout as AnyLayout
+from spt_jax.keypoints.making_regressors import keypoint_regressor as keypoint_regressor
 from spt_jax.keypoints.regressor import KeypointRegressor as KeypointRegressor
-from spt_jax.keypoints.regressor import keypoint_regressor as keypoint_regressor
 from spt_jax.keypoints.tracks import find_tracks as find_tracks
