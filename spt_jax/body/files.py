@@ -13,7 +13,8 @@ from jaxtyping import DTypeLike
 from spt_jax._mesh_check import check_mesh
 from spt_jax.body.family import ARRAYS, body_of
 from spt_jax.body.model import BodyModel
-from spt_jax.files.limits import as_file, file_errors, read_bytes, read_npz
+from spt_jax.files.archives import read_npz
+from spt_jax.files.limits import as_file, file_errors, read_bytes
 from spt_jax.files.pickles import read_pickle
 from spt_jax.files.stand_ins import dense_array
 from spt_jax.overlap.caps import holes_in_words

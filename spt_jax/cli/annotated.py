@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spt_jax.cli.motions import select_frames
-from spt_jax.files.limits import read_json, read_npz
+from spt_jax.files.archives import read_npz
+from spt_jax.files.limits import read_json
 
 if TYPE_CHECKING:
     from spt_jax._camera import PinholeCamera

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from spt_jax.files.limits import read_json, read_npz
+from spt_jax.files.archives import read_npz
+from spt_jax.files.limits import read_json
 from spt_jax.files.outputs import atomic_write, ensure_folder, write_json
 
 FOLDER = "unfinished"

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from spt_jax.files.limits import MAX_JSON_BYTES, as_file, read_bytes, read_json, read_npz
+from spt_jax.files.archives import read_npz
+from spt_jax.files.limits import MAX_JSON_BYTES, as_file, read_bytes, read_json
 from spt_jax.keypoints.coco import from_annotations, from_mmpose, from_results
 from spt_jax.keypoints.confidences import CONFIDENCES
 from spt_jax.keypoints.deeplabcut import from_deeplabcut

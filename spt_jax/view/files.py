@@ -14,7 +14,8 @@ from jaxtyping import Float
 from spt_jax._mesh_check import check_mesh
 from spt_jax.body import AbstractBody, RigModel, load_body, load_mocap
 from spt_jax.body.poses import SMPL_LAYOUTS
-from spt_jax.files.limits import as_file, read_bytes, read_npz
+from spt_jax.files.archives import read_npz
+from spt_jax.files.limits import as_file, read_bytes
 from spt_jax.io.mesh_files import read_mesh, write_mesh
 from spt_jax.io.pose_files import MotionFile, Track, is_pose_file, open_poses, write_poses
 from spt_jax.io.rigs.arrays import write_rig_poses

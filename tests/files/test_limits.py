@@ -11,14 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from spt_jax.files.limits import (
-    TooLargeError,
-    as_file,
-    file_errors,
-    read_bytes,
-    read_json,
-    read_npz,
-)
+from spt_jax.files.archives import read_npz
+from spt_jax.files.limits import TooLargeError, as_file, file_errors, read_bytes, read_json
 from spt_jax.io.poses.containers import open_container
 from spt_jax.keypoints import read_keypoints
 from spt_jax.show.overlay import read_image

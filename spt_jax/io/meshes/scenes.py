@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spt_jax.files.limits import check_archive
+from spt_jax.files.archives import check_archive
 from spt_jax.io.meshes.gltf_check import check_gltf, gltf_extras, gltf_tree, needs_draco
 from spt_jax.io.meshes.raw import RawMesh, UnreadableError
 

@@ -17,17 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from spt_jax.files.archives import DAMAGE, array_header, named_field, npy_header, open_archive
 from spt_jax.files.limits import (
-    DAMAGE,
     MAX_BYTES,
     TooLargeError,
-    array_header,
     as_file,
     check_bytes,
     file_errors,
-    named_field,
-    npy_header,
-    open_archive,
     parse_json,
     read_bytes,
 )
