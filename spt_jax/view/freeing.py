@@ -12,7 +12,7 @@ from spt_jax.overlap.measure import Sampling
 from spt_jax.untangle.mesh import untangle_checked
 from spt_jax.untangle.pose import untangle_pose
 from spt_jax.untangle.spread import Surface
-from spt_jax.view.scene import Scene
+from spt_jax.view.scene import Reading, Scene
 
 Show = Callable[[Float[np.ndarray, "V 3"], str], None]
 
@@ -75,6 +75,19 @@ def untangle_scene(scene: Scene, show: Show, stopped: Callable[[], bool]) -> Non
             _untangle_vertices(scene, show, stopped)
     except Stopped:
         pass
+
+
+def outcome(before: Reading, after: Reading) -> str:
+    """What came of a search, in words."""
+    if after.error is not None:
+        return after.error
+    if before.is_free:
+        return "nothing to untangle"
+    if after.is_free:
+        return "intersection-free"
+    if not after.intersecting_pairs:
+        return "not intersection-free: no faces intersect, but a part is enclosed in another"
+    return f"not intersection-free: {after.intersecting_pairs} intersecting pairs left"
 
 
 def _untangle_pose(scene: Scene, show: Show, stopped: Callable[[], bool]) -> None:

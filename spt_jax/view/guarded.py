@@ -29,6 +29,21 @@ _LOGGER.addHandler(logging.NullHandler())
 _STARTING = threading.Lock()
 
 
+def import_viser() -> Any:
+    """Return viser.
+
+    Raises:
+        ImportError: it is not installed; the message names the extra.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError(
+            f'the live view needs viser: got "{error}"; run: pip install "spt_jax[view]"'
+        ) from error
+    return viser
+
+
 def start_guarded(viser: Any, access: Access, numeric: str, port: int, patience: float = PATIENCE):
     """Return a viser server that answers nobody whom `access` refuses.
 

@@ -3,34 +3,30 @@
 import sys
 import threading
 import traceback
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from spt_jax._mesh_check import check_mesh
-from spt_jax.body import load_body
 from spt_jax.io.pose_files import MotionFile
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
-from spt_jax.view.beside import Beside, Player, freed, matched
-from spt_jax.view.freeing import Stopped, untangle_scene
+from spt_jax.view.beside import Beside, Player, freed
+from spt_jax.view.freeing import Stopped, outcome, untangle_scene
 from spt_jax.view.guarded import (
     PATIENCE,
     drop_removed_nodes,
     drop_who_does_not_read,
+    import_viser,
     start_guarded,
     stop_quietly,
 )
+from spt_jax.view.opened import as_beside, as_shown, embedded_body
 from spt_jax.view.panel import MEASURES, Panel
 from spt_jax.view.scene import Reading, Scene
 from spt_jax.view.stage import Stage
 from spt_jax.view.uploads import UPLOAD_LIMIT, Uploads
 from spt_jax.view.worker import Worker
 
-# A fist in the belly: something to untangle at first sight.
-_FIRST = ("punch", "punch/0013")
 _ERROR_SECONDS = 15.0
 # What ends a search under way: the newest request has priority.
 _EDITS = frozenset(
@@ -95,7 +91,7 @@ class View:
         self._player = Player(self.worker, self._advance, self._rate)
         try:
             name = None if file is None else file.name
-            self._take(opened if opened is not None else _embedded_body(), name, first=True)
+            self._take(opened if opened is not None else embedded_body(), name, first=True)
             if isinstance(other, MotionFile) and isinstance(opened, MotionFile):
                 self._put_beside(self._matched(opened, other, beside.name))  # type: ignore
         except Exception:
@@ -207,7 +203,7 @@ class View:
         finally:
             self._untangling = False
             self.panel.show_busy(False)
-        self._status = "stopped" if self._stop.is_set() else _outcome(before, self.scene.read())
+        self._status = "stopped" if self._stop.is_set() else outcome(before, self.scene.read())
 
     def untangle_motion(self) -> None:
         """Untangle all frames of the motion as one, and show what comes of it beside."""
@@ -239,7 +235,7 @@ class View:
 
     def open_embedded(self) -> None:
         """Show the body that comes with the package."""
-        self._take(_embedded_body(), None, first=False)
+        self._take(embedded_body(), None, first=False)
 
     def save_mesh(self, client: Any) -> None:
         """Hand the surface to the browser that asked."""
@@ -270,12 +266,10 @@ class View:
         self.choose_frame(row)
 
     def _matched(self, opened: MotionFile, other: MotionFile, name: str) -> Beside:
-        body = self.scene.body
-        shown, _ = files.motions_of(opened, "", body, embedded=self._embedded)  # type: ignore
-        named = dict(zip(self._motions, shown.values(), strict=False))  # the file's come first
-        others, notes = files.motions_of(other, "", body, embedded=self._embedded)  # type: ignore
+        body, motions = self.scene.body, list(self._motions)
+        put, notes = as_beside(opened, other, name, body, motions, embedded=self._embedded)  # type: ignore
         self._notes += [note for note in notes if note not in self._notes]
-        return Beside(body, name, matched(named, others))  # type: ignore
+        return put
 
     def _put_beside(self, beside: Beside) -> None:
         self._beside = beside
@@ -292,31 +286,8 @@ class View:
     def _take(
         self, opened: Scene | MotionFile | files.Rigged, name: str | None, *, first: bool
     ) -> None:
-        notes: Sequence[str] = ()
-        if isinstance(opened, MotionFile):
-            scene = self.scene if not first else _embedded_body()
-            if scene.body is None:
-                scene, self._embedded = _embedded_body(), True
-            shown, notes = files.motions_of(
-                opened,
-                name or "poses",
-                scene.body,  # type: ignore
-                embedded=self._embedded,
-            )
-            motions, start = {**shown, **files.mocap_for(scene.body)}, (next(iter(shown)), 0)  # type: ignore
-        elif isinstance(opened, files.Rigged):
-            scene, motions, self._embedded = opened.scene, opened.motions, False
-            start = (list(motions)[min(1, len(motions) - 1)], 0)  # the first animation
-            problems = check_mesh(scene.vertices, scene.faces).problems
-            notes = [*opened.notes, *problems]
-        else:
-            scene = opened
-            self._embedded = name is None
-            motions = {} if scene.body is None else files.mocap_for(scene.body)
-            if scene.body is not None and not self._embedded:
-                found = check_mesh(np.asarray(scene.body.template), scene.faces)  # type: ignore
-                notes = found.problems or found.warnings[: found.holes > 0]
-            start = (_FIRST[0], motions[_FIRST[0]].names.index(_FIRST[1])) if motions else None
+        shown = as_shown(opened, name, None if first else self.scene, embedded=self._embedded)
+        scene, motions, start, embedded, notes = shown
         if start is not None:
             motions[start[0]].load_into(scene, start[1])
         reading = scene.read()  # distances along the surface at rest take two seconds, once
@@ -324,6 +295,7 @@ class View:
             raise ValueError(reading.error)
         self._player.play(False)
         self.scene, self._motions, self._beside = scene, motions, None
+        self._embedded = embedded
         self._status = "ready" if start is None else motions[start[0]].names[start[1]]
         drop_removed_nodes(self.server)
         self._stage.begin(scene, reading)
@@ -363,34 +335,3 @@ class View:
     def _say_notes(self, client: Any) -> None:
         for note in self._notes:
             client.add_notification("Note", note, auto_close_seconds=_ERROR_SECONDS)
-
-
-def import_viser() -> Any:
-    """Return viser.
-
-    Raises:
-        ImportError: it is not installed; the message names the extra.
-    """
-    try:
-        import viser
-    except ImportError as error:
-        raise ImportError(
-            f'the live view needs viser: got "{error}"; run: pip install "spt_jax[view]"'
-        ) from error
-    return viser
-
-
-def _embedded_body() -> Scene:
-    return Scene.of_body(load_body(), "the embedded body")
-
-
-def _outcome(before: Reading, after: Reading) -> str:
-    if after.error is not None:
-        return after.error
-    if before.is_free:
-        return "nothing to untangle"
-    if after.is_free:
-        return "intersection-free"
-    if not after.intersecting_pairs:
-        return "not intersection-free: no faces intersect, but a part is enclosed in another"
-    return f"not intersection-free: {after.intersecting_pairs} intersecting pairs left"
