@@ -58,7 +58,7 @@ if typing.TYPE_CHECKING:
     from spt_jax.untangle.motion import MotionResult as MotionResult
     from spt_jax.untangle.motion import MotionStep as MotionStep
     from spt_jax.untangle.motion import untangle_motion as untangle_motion
-    from spt_jax.untangle.pose import UntangleResult as UntangleResult
+    from spt_jax.untangle.one_pose import UntangleResult as UntangleResult
     from spt_jax.untangle.pose import untangle_pose as untangle_pose
 
 try:
@@ -156,7 +156,7 @@ __getattr__, __dir__ = _lazy_names(
         "RESULTS": "spt_jax._status",
         "Step": "spt_jax._steps",
         "UntangleMeshResult": "spt_jax.untangle.mesh",
-        "UntangleResult": "spt_jax.untangle.pose",
+        "UntangleResult": "spt_jax.untangle.one_pose",
         "find_contacts": "spt_jax.untangle.contacts",
         "fit_people": "spt_jax.fit.people",
         "fit_pose": "spt_jax.fit.pose",

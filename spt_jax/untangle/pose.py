@@ -1,89 +1,33 @@
-"""Remove a posed body's self-intersections by moving its joints."""
+"""Remove a posed body's self-intersections by moving its joints.
 
-from dataclasses import replace
-from typing import Any, NamedTuple
+Here is what users call; the search for each pose is in `one_pose.py`.
+"""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from spt_jax._contact import as_rows
 from spt_jax._exclusions import as_fold_surface
 from spt_jax._query import MOST_RAYS, as_choice, as_directions, as_margin, as_rays
-from spt_jax._result import Overlap, Result, plain
-from spt_jax._status import RESULTS, in_words, names_of
 from spt_jax._steps import OnStep
 from spt_jax.body import AbstractBody
-from spt_jax.overlap.measure import Measurement, Sampling, Unmeasurable
 from spt_jax.overlap.rays.beam import Rays
-from spt_jax.rest.surface import RestSurface
-from spt_jax.untangle.contacts import held_contacts, is_found
-from spt_jax.untangle.descent import (
-    SOLVER,
-    Folds,
-    Search,
-    descend,
-    descend_in_steps,
-    displacement_factor,
-    faces_of,
-    is_near,
-    pose_of,
-    vertices_of,
-)
-from spt_jax.untangle.mesh import untangle_checked
+from spt_jax.untangle.contacts import is_found
+from spt_jax.untangle.descent import SOLVER, Folds, Search, faces_of
 from spt_jax.untangle.motion_input import as_positive
-from spt_jax.untangle.sides import other_side
+from spt_jax.untangle.one_pose import UntangleResult, WantedContacts, untangle_one
 from spt_jax.untangle.spread import Surface
 
 # Per cubic centimetre, against squared centimetres of displacement. The first is weak enough that
 # the pose slides along the contact rather than jumping out of it; the last leaves about a
 # thousandth of the overlap, whatever its size.
 _WEIGHTS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-# Below this a weight may be too weak to move anything.
-_STRONG = 10.0
-
-
-class UntangleResult(Result):
-    """What `untangle_pose` found.
-
-    Attributes:
-        pose: the best pose of all that were measured.
-        vertices: the body in that pose, in metres; with folds="remove" its vertices were moved on.
-        before, after: the overlap of the pose given and of what was found.
-        steps: of the solver, over all weights.
-        status: how it ended, one of `spt_jax.RESULTS` for each pose.
-    """
-
-    pose: Float[Array, "..."]
-    vertices: Float[Array, "*batch V 3"]
-    before: Overlap
-    after: Overlap
-    steps: Int[Array, "*batch"]
-    status: RESULTS
-
-    @property
-    def is_free(self) -> Bool[Array, "*batch"]:
-        """Whether no parts collide any more; with folds="remove", whether no faces intersect."""
-        return self.status == RESULTS.successful
-
-    @property
-    def reason(self) -> Any:
-        """The status in words: a string, or nested lists of strings over the batch axes."""
-        return in_words(self.status, {"successful": "collision-free"})
-
-    def as_dict(self) -> dict[str, Any]:
-        """All but pose and vertices, as JSON types."""
-        return {
-            "is_free": plain(self.is_free),
-            "status": names_of(self.status),
-            "reason": self.reason,
-            "before": self.before.as_dict(),
-            "after": self.after.as_dict(),
-            "steps": plain(self.steps),
-        }
 
 
 def untangle_pose(
@@ -225,7 +169,7 @@ def untangle_pose(
         solver=solver or SOLVER,
         rest=rest,
     )
-    wanted = _Contacts(
+    wanted = WantedContacts(
         contacts,
         as_positive("contact_distance", contact_distance, zero=True),
         as_positive("contact_weight", contact_weight, zero=True),
@@ -238,21 +182,12 @@ def untangle_pose(
     translations = _per_pose("translation", translation, batch, len(poses))
     surface = Surface(np.asarray(body.faces), body.num_vertices) if way == "remove" else None
     found = [
-        _untangle_one(search, surface, body, *one, wanted, on_step)
+        untangle_one(search, surface, body, *one, wanted, on_step)
         for one in zip(poses, shapes, translations, strict=True)
     ]
     if not found:
         raise ValueError(f"pose must hold at least one pose: got shape {pose.shape}.")
     return jax.tree.map(lambda *leaves: _stacked(leaves, batch), *found)
-
-
-class _Contacts(NamedTuple):
-    """What contact is to be kept."""
-
-    contacts: Any
-    distance: float
-    weight: float
-    rest: RestSurface | None
 
 
 def _stacked(leaves: tuple[Array | np.ndarray, ...], batch: tuple[int, ...]) -> Array:
@@ -272,108 +207,6 @@ def _as_search_rays(rays: Any) -> Rays:
             f"measured with: got {rays!r}."
         )
     return search_rays
-
-
-def _untangle_one(
-    search: Search,
-    surface: Surface | None,
-    body: AbstractBody,
-    pose: Array,
-    shape: Array | None,
-    translation: Array | None,
-    wanted: "_Contacts",
-    on_step: OnStep | None,
-) -> UntangleResult:
-    vertices, faces = vertices_of(body, pose, shape, translation), faces_of(body)
-    before = search.measure(vertices, faces)
-    best, after, steps = pose, before, 0
-    ended, diverged = RESULTS.successful, False
-    if not search.is_free(before):
-        if wanted.contacts is not None:
-            held = held_contacts(body, before.vertices, *wanted, dtype=pose.dtype)
-            search = replace(search, contacts=held)
-        factor = displacement_factor(body, pose, shape)
-        moved = jnp.asarray(np.zeros(factor.shape[:1], pose.dtype))
-        idle = 0
-        for stage, (margin, weight) in enumerate(search.attempts()):
-            arguments = (
-                search,
-                body,
-                (pose, shape, translation, factor),
-                moved,
-                margin,
-                jnp.asarray(weight, pose.dtype),
-            )
-            if on_step is None:
-                there, taken, ended = descend(*arguments)
-            else:
-                there, taken, ended = descend_in_steps(*arguments, stage, steps, on_step)
-            steps += int(taken)
-            candidate = pose_of(body, pose, factor, there)
-            found = _measured(search, body, pose, candidate, shape, translation)
-            if found is None:
-                diverged = True
-                continue
-            moved, (posed, overlap) = there, found
-            falls = overlap.volume < 0.99 * after.volume
-            idle = 0 if falls else idle + 1
-            if search.rank(overlap) < search.rank(after):
-                best, after, vertices = candidate, overlap, posed
-            # Two in a row that gain nothing mean that the volume no longer falls.
-            stuck = search.folds == "count" and idle >= 2 and weight >= _STRONG
-            if search.is_free(after) or stuck:
-                break
-        side = other_side(search, body, (pose, shape, translation, factor), before, after)
-        if side is not None:
-            best, after, vertices = side.pose, side.found, side.vertices
-            steps, diverged = steps + side.steps, False
-    free = search.is_free(after)
-    if surface is not None and after.total_intersecting_pairs:
-        sampling = Sampling(None, search.directions)
-        skin = untangle_checked(np.asarray(vertices), surface, sampling)
-        if skin.moved:
-            vertices = jnp.asarray(skin.vertices)
-            after = search.measure(vertices, faces)
-        free, ended = skin.is_free, skin.status
-    return UntangleResult(
-        pose=best,
-        vertices=vertices,
-        before=_overlap(before, pose.dtype),
-        after=_overlap(after, pose.dtype),
-        steps=jnp.asarray(steps),
-        status=_status(free, diverged, ended),
-    )
-
-
-def _measured(search: Search, body, pose, candidate, shape, translation):
-    """The vertices and the overlap of a pose, or None where it has run away."""
-    if not is_near(candidate, pose):
-        return None
-    posed = vertices_of(body, candidate, shape, translation)
-    try:
-        return posed, search.measure(posed, faces_of(body))
-    except Unmeasurable:
-        return None
-
-
-def _overlap(found: Measurement, dtype: Any) -> Overlap:
-    return Overlap(
-        volume=jnp.asarray(found.volume, dtype),
-        total_volume=jnp.asarray(found.total_volume, dtype),
-        ratio=jnp.asarray(np.mean(found.labels("vertex") != 0), dtype),
-        intersecting_pairs=jnp.asarray(found.intersecting_pairs, jnp.int32),
-        total_intersecting_pairs=jnp.asarray(found.total_intersecting_pairs, jnp.int32),
-    )
-
-
-def _status(free: bool, diverged: bool, ended: Any) -> Any:
-    if free:
-        return RESULTS.successful
-    if diverged:
-        return RESULTS.nonlinear_divergence
-    if ended == RESULTS.successful:
-        return RESULTS.intersections_left
-    return ended
 
 
 def _per_pose(name, array, batch, count):

@@ -15,7 +15,7 @@ from helpers import body_faces, embedded_body, mocap
 
 from spt_jax import RESULTS, BodyModel, self_intersection_penalty, untangle_pose
 from spt_jax.overlap.measure import Unmeasurable
-from spt_jax.untangle import pose as untangle
+from spt_jax.untangle import one_pose as untangle
 
 QUICK = {"folds": "count", "rays": 64, "weights": (0.1, 1.0, 10.0), "steps_per_weight": 20}
 
