@@ -9,7 +9,8 @@ import trimesh
 from jaxtyping import Array, Bool, Float, UInt8
 
 from spt_jax.body import BodyModel
-from spt_jax.fit.spheres.model import BodySpheres, sphere_depths
+from spt_jax.fit.spheres.model import BodySpheres
+from spt_jax.fit.spheres.penalty import sphere_depths
 from spt_jax.io.mesh_files import PENETRATING_COLOR
 from spt_jax.show.framing import View, frame
 from spt_jax.show.look import GAP, MATERIAL, Picture, check_png, check_size, finished

@@ -9,7 +9,8 @@ from helpers import embedded_body, mocap
 from helpers_body import PARENTS, slow_body, synthetic_smpl
 
 from spt_jax.body import BodyModel
-from spt_jax.fit.spheres.model import BodySpheres, sphere_depths, sphere_penalty
+from spt_jax.fit.spheres.model import BodySpheres
+from spt_jax.fit.spheres.penalty import sphere_depths, sphere_penalty
 
 
 def body_of(vertices, faces, weights, joints, parents, shape_basis=None):

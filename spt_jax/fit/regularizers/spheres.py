@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from spt_jax.body import BodyModel
 from spt_jax.fit.problem.variables import Variables
 from spt_jax.fit.regularizers._base import Regularizer, as_weights
-from spt_jax.fit.spheres.model import BodySpheres, sphere_penalty
+from spt_jax.fit.spheres.model import BodySpheres
+from spt_jax.fit.spheres.penalty import sphere_penalty
 
 _CENTIMETER = 0.01
 

@@ -1,4 +1,7 @@
-"""A body approximated by spheres, the paper's rival "RE + SA", and how far they collide."""
+"""A body approximated by spheres, the paper's rival "RE + SA", at rest and in poses.
+
+How far they collide is in `penalty.py`.
+"""
 
 from typing import NamedTuple
 
@@ -14,10 +17,6 @@ from spt_jax.body.rotations import matrix_from_axis_angle
 from spt_jax.body.skinning import blend_shapes, forward_kinematics, lift
 from spt_jax.fit.spheres.fitting import Rest, fit_spheres
 from spt_jax.fit.spheres.surface_samples import sample_surface
-
-# Distances at rest round differently from those in a pose; a pair that the shape alone brings
-# together may come this part nearer for nothing.
-_SLACK = 1e-5
 
 
 class PosedSpheres(NamedTuple):
@@ -168,12 +167,12 @@ class BodySpheres(eqx.Module):
             >>> BodySpheres.fit(body).posed(body, jnp.zeros((8, 52, 3))).centers.shape
             (8, 114, 3)
         """
-        angles, betas = _arguments(body, pose, shape)
+        angles, betas = as_arguments(body, pose, shape)
         shift = jnp.zeros(3) if translation is None else jnp.asarray(translation)
         if shift.ndim < 1 or shift.shape[-1] != 3:
             raise ValueError(f"translation must be (..., 3): got shape {shift.shape}.")
         shift = shift.astype(angles.dtype)
-        centers, radii = _posed(self, _Tree(body), angles, betas)
+        centers, radii = posed_on(self, Tree(body), angles, betas)
         rank = max(centers.ndim - 2, shift.ndim - 1)
         centers = lift(centers, rank, 2) + lift(shift, rank, 1)[..., None, :]
         return PosedSpheres(centers, jnp.broadcast_to(lift(radii, rank, 1), centers.shape[:-1]))
@@ -211,76 +210,7 @@ class BodySpheres(eqx.Module):
         return Coverage(float(inside * each), float((held.sum() - inside) * each))
 
 
-def sphere_penalty(
-    spheres: BodySpheres,
-    body: BodyModel,
-    pose: Float[Array | np.ndarray, "*#batch J 3"],
-    shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
-    translation: Float[Array | np.ndarray, "*#batch 3"] | None = None,
-) -> Float[Array, "*batch"]:
-    """How far the spheres of a posed body collide, as a loss.
-
-    The sum over pairs (i, j) that may collide of max(0, reach - |c_i - c_j|)^2, the squared depth,
-    with reach = r_i + r_j, or the centers' distance at rest where the shape alone already brings
-    the spheres together. So it is zero in the zero pose, for every shape. The paper says only
-    "the intersection between spheres"; SMPLify's capsules are turned into Gaussians
-    exp(-d^2 / (s_i^2 + s_j^2)), which push parts that do not touch. The depth is zero there and,
-    unlike the volume of the lens, does not lose its force when spheres barely touch or when one
-    is inside the other.
-
-    Args:
-        spheres: fitted to the body.
-        body, pose, shape: as in `BodySpheres.posed`; the global orientation changes nothing.
-        translation: of the body; it changes nothing, and is taken so that terms are called alike.
-
-    Returns:
-        One number per body, in m^2, in the dtype of `pose`.
-
-    Raises:
-        TypeError, ValueError: as the body does.
-
-    Differentiation: every mode; finite everywhere, zero between spheres that share their center.
-        Once differentiable in all, twice but where spheres begin to touch.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> from spt_jax import load_body, load_mocap
-        >>> from spt_jax.fit.spheres.model import BodySpheres, sphere_penalty
-        >>> body, mocap = load_body(), load_mocap()
-        >>> spheres = BodySpheres.fit(body)
-        >>> punch = body.pose_from_smpl(mocap.pose[mocap.names.index("punch/0007")])
-        >>> penalty = sphere_penalty(spheres, body, jnp.stack([punch, 0 * punch]))
-        >>> bool(penalty[0] > 1e-3), float(penalty[1])
-        (True, 0.0)
-    """
-    angles, betas = _arguments(body, pose, shape)
-    return jnp.sum(_depths(spheres, _Tree(body), angles, betas) ** 2, axis=(-2, -1))
-
-
-def sphere_depths(
-    spheres: BodySpheres,
-    body: BodyModel,
-    pose: Float[Array | np.ndarray, "*#batch J 3"],
-    shape: Float[Array | np.ndarray, "*#batch B"] | None = None,
-) -> Float[Array, "*batch S S"]:
-    """How deep each pair of spheres collides, in metres: what `sphere_penalty` squares and sums.
-
-    Args:
-        spheres, body, pose, shape: as in `sphere_penalty`.
-
-    Returns:
-        Depths above the diagonal; zero where a pair does not collide or is excluded.
-
-    Raises:
-        TypeError, ValueError: as the body does.
-
-    Differentiation: as `sphere_penalty`; one-sided where spheres begin to touch.
-    """
-    angles, betas = _arguments(body, pose, shape)
-    return _depths(spheres, _Tree(body), angles, betas)
-
-
-class _Tree(eqx.Module):
+class Tree(eqx.Module):
     """The joints of a body: all that its spheres need, so that jit is not handed its surface."""
 
     joints: Float[Array, "J 3"]
@@ -293,10 +223,11 @@ class _Tree(eqx.Module):
 
 
 @jax.jit
-def _posed(spheres: BodySpheres, tree: _Tree, angles, betas):
+def posed_on(spheres: BodySpheres, tree: Tree, angles, betas):
+    """Centers and radii of the spheres in a pose, without a translation."""
     dtype = angles.dtype
     rank = max(angles.ndim - 2, 0 if betas is None else betas.ndim - 1)
-    joints, centers, radii = _at_rest(spheres, tree, betas, dtype)
+    joints, centers, radii = at_rest(spheres, tree, betas, dtype)
     rotations = lift(matrix_from_axis_angle(angles), rank, 3)
     joints, centers, radii = lift(joints, rank, 2), lift(centers, rank, 2), lift(radii, rank, 1)
     world, positions = forward_kinematics(rotations, joints, tree.parents)
@@ -306,19 +237,8 @@ def _posed(spheres: BodySpheres, tree: _Tree, angles, betas):
     return positions[..., part, :] + turned, radii
 
 
-@jax.jit
-def _depths(spheres: BodySpheres, tree: _Tree, angles, betas):
-    centers, radii = _posed(spheres, tree, angles, betas)
-    rank = centers.ndim - 2
-    _, rest, _ = _at_rest(spheres, tree, betas, angles.dtype)
-    # All pairs, not a gather of the included ones: the gradient of a gather is a scatter.
-    reach = radii[..., :, None] + radii[..., None, :]
-    reach = jnp.minimum(reach, lift((1 - _SLACK) * _distances(rest), rank, 2))
-    counts = spheres.counts.reshape((1,) * rank + spheres.counts.shape)
-    return jnp.where(counts, jnp.maximum(reach - _distances(centers), 0.0), 0.0)
-
-
-def _at_rest(spheres: BodySpheres, tree: _Tree, betas, dtype):
+def at_rest(spheres: BodySpheres, tree: Tree, betas, dtype):
+    """Joints, centers and radii of the body at rest in a shape."""
     joints = blend_shapes(tree.joints, tree.basis, betas, dtype)
     centers = blend_shapes(spheres.centers, spheres.center_shape_basis, betas, dtype)
     radii = spheres.radii.astype(dtype)
@@ -329,14 +249,8 @@ def _at_rest(spheres: BodySpheres, tree: _Tree, betas, dtype):
     return joints, centers, jnp.maximum(radii, 0.0)
 
 
-def _distances(points):
-    """Between all pairs; where two coincide zero, with a derivative of zero."""
-    square = jnp.sum((points[..., :, None, :] - points[..., None, :, :]) ** 2, axis=-1)
-    apart = square > 0
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
-
-
-def _arguments(body: BodyModel, pose, shape):
+def as_arguments(body: BodyModel, pose, shape):
+    """Pose and shape, checked against the body; no shape stays None."""
     angles = jnp.asarray(pose)
     if not jnp.issubdtype(angles.dtype, jnp.floating):
         raise TypeError(f"pose must be floating-point: got dtype {angles.dtype}.")
