@@ -25,7 +25,6 @@ _FEW_RAYS = 16
 class Root:
     """The end of an edge in each part, where nothing of the part lies beyond along x."""
 
-    part: Int[np.ndarray, "C"]
     row: Int[np.ndarray, "C"]
     end: Int[np.ndarray, "C"]
 
@@ -79,7 +78,7 @@ def roots_of(topology: Topology, manifold: Manifold, predicates: Predicates, lay
     # Seen from the edge, the part lies within the wedge of its two triangles: is it solid?
     side, _ = predicates.volume(corners.T, across)
     inverted = side > 0
-    root = Root(names, row, end)
+    root = Root(row, end)
     own = layers(names, names)
     value = np.where(inverted, -times[names], 0)[:, None] * own
     if len(names) > 1:
