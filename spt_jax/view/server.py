@@ -1,8 +1,5 @@
 """The live view: viser's server, its panel and stage, and the worker that serves them."""
 
-import sys
-import threading
-import traceback
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -10,8 +7,7 @@ from typing import Any
 from spt_jax.io.pose_files import MotionFile
 from spt_jax.view import files
 from spt_jax.view.access import access_for, free_port
-from spt_jax.view.beside import Beside, Player, freed
-from spt_jax.view.freeing import Stopped, outcome, untangle_scene
+from spt_jax.view.beside import Beside, Player
 from spt_jax.view.guarded import (
     PATIENCE,
     drop_removed_nodes,
@@ -20,14 +16,15 @@ from spt_jax.view.guarded import (
     start_guarded,
     stop_quietly,
 )
+from spt_jax.view.notices import tell_error, tell_notes
 from spt_jax.view.opened import as_beside, as_shown, embedded_body
 from spt_jax.view.panel import MEASURES, Panel
 from spt_jax.view.scene import Reading, Scene
+from spt_jax.view.searches import Searches
 from spt_jax.view.stage import Stage
 from spt_jax.view.uploads import UPLOAD_LIMIT, Uploads
 from spt_jax.view.worker import Worker
 
-_ERROR_SECONDS = 15.0
 # What ends a search under way: the newest request has priority.
 _EDITS = frozenset(
     {"choose_motion", "choose_frame", "turn_axis", "turn_in_world", "set_shape"}
@@ -79,8 +76,7 @@ class View:
         self._max_bytes = max_bytes
         port = free_port(numeric, port)
         self.server = start_guarded(viser, self.access, numeric, port, patience)
-        self._stop = threading.Event()
-        self._untangling = False
+        self._searches = Searches()
         self._notes: list[str] = []
         self._stage = Stage(self.server)
         self._status = "ready"
@@ -117,7 +113,7 @@ class View:
 
     def stop_serving(self, timeout: float = 5.0) -> bool:
         """End the server; whether the work under way ended too."""
-        self._stop.set()
+        self._searches.stop()
         self._player.play(False)
         ended = self.worker.stop(timeout)
         drop_who_does_not_read(self.server)
@@ -189,44 +185,17 @@ class View:
 
     def untangle(self) -> None:
         """Untangle the scene and show every step."""
-        self._stop.clear()
-        self._untangling = True
-        self.panel.show_busy(True)
-        before = self.scene.read()
-        self._show(before, "untangling; the first time takes some seconds to compile")
-        try:
-            untangle_scene(
-                self.scene,
-                lambda vertices, text: self._show(self.scene.read(vertices), f"untangling: {text}"),
-                self._stop.is_set,
-            )
-        finally:
-            self._untangling = False
-            self.panel.show_busy(False)
-        self._status = "stopped" if self._stop.is_set() else outcome(before, self.scene.read())
+        self._status = self._searches.of_scene(self.scene, self.panel, self._show)
 
     def untangle_motion(self) -> None:
         """Untangle all frames of the motion as one, and show what comes of it beside."""
         motion, body = self.panel.motion.value, self.scene.body
-        self._stop.clear()
-        self._untangling = True
-        self.panel.show_busy(True)
-        reading = self.scene.read()
-        try:
-            frames, outcome = freed(
-                body,  # pyright: ignore[reportArgumentType]
-                self._motions[motion],
-                lambda text: self._show(reading, text),
-                self._stop.is_set,
-            )
-        except Stopped:
-            self._status = "stopped"
-            return
-        finally:
-            self._untangling = False
-            self.panel.show_busy(False)
-        self._put_beside(Beside(body, "the motion untangled", {motion: frames}))  # type: ignore
-        self._status = outcome
+        frames, status = self._searches.of_motion(
+            self.scene, self._motions[motion], self.panel, self._show
+        )
+        if frames is not None:
+            self._put_beside(Beside(body, "the motion untangled", {motion: frames}))  # type: ignore
+        self._status = status
 
     def open_upload(self, name: str, content: bytes) -> None:
         """Show a file that a browser sent; a bad one changes nothing."""
@@ -250,8 +219,8 @@ class View:
     # How.
 
     def _do(self, key: Hashable, action: str, *arguments: Any, **keywords: Any) -> None:
-        if action == "stop" or (self._untangling and action in _EDITS):
-            self._stop.set()  # now, and not after what it is to stop
+        if action == "stop" or (self._searches.under_way and action in _EDITS):
+            self._searches.stop()  # now, and not after what it is to stop
         if action == "stop":
             return
         self.worker.post(key, lambda: getattr(self, action)(*arguments, **keywords))
@@ -321,17 +290,7 @@ class View:
         self.panel.show_figures(reading, reading.error or status)
 
     def _report(self, error: Exception) -> None:
-        message = " ".join(str(error).split())
-        # ImportError: a package that a format needs.
-        if not isinstance(error, ImportError | OSError | TypeError | ValueError):
-            traceback.print_exception(error, file=sys.stderr)
-            message = f"{type(error).__name__}: {message}"
-        self._status = message
-        for client in self.server.get_clients().values():
-            client.add_notification(
-                "That did not work", message, auto_close_seconds=_ERROR_SECONDS, color="red"
-            )
+        self._status = tell_error(self.server, error)
 
     def _say_notes(self, client: Any) -> None:
-        for note in self._notes:
-            client.add_notification("Note", note, auto_close_seconds=_ERROR_SECONDS)
+        tell_notes(client, self._notes)

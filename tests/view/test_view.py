@@ -411,10 +411,10 @@ def test_a_body_with_a_hole_is_shown_with_a_note_and_an_edit_ends_a_search(tmp_p
     view = View(tmp_path / "holed.npz", port=18_775)
     try:
         assert len(view._notes) == 1 and "closed by fans" in view._notes[0]
-        view._untangling = True  # as while a search runs
+        view._searches.under_way = True  # as while a search runs
         view._do("through", "see_through", False)
-        assert not view._stop.is_set()
+        assert not view._searches.stopped
         view._do("slider", "turn_axis", _ELBOW, 1, 10.0)
-        assert view._stop.is_set()
+        assert view._searches.stopped
     finally:
         view.stop_serving()
