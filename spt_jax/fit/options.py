@@ -184,7 +184,7 @@ class Scene(eqx.Module):
         margin: how far apart surfaces are pushed, in metres.
         fold_distance: how near to each other, along the rest surface and in metres, sheets of one
             body are folds; None: the body's own distances, place by place.
-        solver: any optimistix minimiser; a BFGS by default.
+        solver: any optimistix minimiser; None for the penalty's own search on the host.
         max_steps: of each stage.
 
     Raises:

@@ -19,8 +19,11 @@ from spt_jax._status import RESULTS
 from spt_jax._steps import OnStep, Step
 from spt_jax.body import BodyModel
 from spt_jax.bridge.programs import program
+from spt_jax.fit.contact.cuts import Cuts
+from spt_jax.fit.contact.descent import descend as descend_by_cuts
+from spt_jax.fit.contact.places import Ground
 from spt_jax.fit.options import Numbers, Scene, Search, Stages, Start, Terms
-from spt_jax.fit.pose import fit_each
+from spt_jax.fit.pose import finished, fit_each, has_cuts, objective_of
 from spt_jax.fit.problem.inputs import Keypoints, Person
 from spt_jax.fit.regularizers._base import Regularizer
 from spt_jax.fit.regularizers.spt import SelfIntersection
@@ -122,8 +125,9 @@ def fit_people(
 
     Each is fitted alone by `fit_pose`; then all of their parameters together minimise the sum of
     their objectives and the overlap of the whole scene, between and within people, its weight
-    rising. Where faces of two people, or of two parts of one, still intersect, the last weight is
-    tried again with two, four and eight times the margin.
+    rising; by the search on the host that `fit_pose` has, unless `scene` has a solver. Where faces
+    of two people, or of two parts of one, still intersect, the last weight is tried again with two,
+    four and eight times the margin.
 
     Args:
         body: any `BodyModel`.
@@ -199,17 +203,21 @@ def _settle(
     after, steps, count = before, jnp.array(0), 0
     _tell(on_step, setup.body, rest, count, 0, best)
     rising = list(setup.regularizer.weights[:, None])
+    on_host = _OnHost(setup, people) if has_cuts(setup) else None
     gap = scene.margin
     attempts = [(gap, rising)] + [(gap * more, rising[-1:]) for more in _WIDER if gap]
     for attempt, stages in attempts:
         fits = best
         for weight in stages:  # one stage a call: all are one program
-            changed = dataclasses.replace(
-                setup.regularizer, margin=jnp.asarray(attempt), weights=weight
-            )
-            fits, taken = _descend_together(
-                dataclasses.replace(setup, regularizer=changed), people, fits
-            )
+            if on_host is not None:
+                fits, taken = on_host.stage(fits, float(weight[0]), attempt)
+            else:
+                changed = dataclasses.replace(
+                    setup.regularizer, margin=jnp.asarray(attempt), weights=weight
+                )
+                fits, taken = _descend_together(
+                    dataclasses.replace(setup, regularizer=changed), people, fits
+                )
             steps, count = steps + taken, count + 1
             _tell(on_step, setup.body, rest, count, int(steps), fits)
         found = _penetration(setup.body, fits.vertices, rest)
@@ -235,6 +243,54 @@ def _tell(
 
     vertices = np.asarray(fits.vertices).reshape(-1, 3)
     on_step(Step(stage, taken, vertices, None, volume_and_pairs))
+
+
+class _OnHost:
+    """Stages of a scene by the search on the host."""
+
+    def __init__(self, setup: Setup, people: Person):
+        assert isinstance(setup.regularizer, SelfIntersection)
+        self._setup = setup
+        count = len(people.keypoints)
+        self._people = [jax.tree.map(lambda leaf, k=k: leaf[k], people) for k in range(count)]
+        objectives = [objective_of(setup.search, one) for one in self._people]
+        self._ground = Ground(setup.body, objectives, setup.regularizer)
+        # What is known of the overlap holds for one margin.
+        self._margin, self._cuts = np.nan, Cuts(count, 0)
+
+    def stage(
+        self, fits: FitResult, weight: float, margin: float
+    ) -> tuple[FitResult, Int[np.ndarray, ""]]:
+        """The fits after a stage, and how many places were measured; as they are if none can be."""
+        ground, setup = self._ground, self._setup
+        rows = [
+            one.pack(one.start._replace(pose=p, shape=s, translation=t))
+            for one, p, s, t in zip(
+                ground.people, fits.pose, fits.shape, fits.translation, strict=True
+            )
+        ]
+        vector = np.stack([np.asarray(row, np.float64) for row in rows])
+        if margin != self._margin:
+            self._margin, self._cuts = margin, Cuts(*vector.shape)
+        before, place = ground.looks, ground.look(vector, margin)
+        if place is None:
+            return fits, np.array(0)
+        end = descend_by_cuts(ground.look, place, self._cuts, weight, margin, setup.max_steps)
+        each = [
+            finished(
+                setup.search,
+                setup.body,
+                person,
+                jnp.asarray(row, ground.dtype),
+                {},
+                jnp.asarray(end.converged),
+                steps,
+                jnp.asarray(True),
+            )
+            for person, row, steps in zip(self._people, end.place.vector, fits.steps, strict=True)
+        ]
+        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+        return found, np.array(ground.looks - before)
 
 
 @program

@@ -141,9 +141,8 @@ def fit_each(setup: Setup, people: Person, on_step: OnStep | None = None) -> Fit
     # took 1.3 times as long as one by one. Nor in threads: two of these programs at a time make
     # XLA's CPU client wait for itself for ever (jax 0.10.2, two cores).
     count = len(people.keypoints)
-    by_cuts = _has_cuts(setup)
     rows = [jax.tree.map(lambda leaf, k=k: leaf[k], people) for k in range(count)]
-    if by_cuts:
+    if has_cuts(setup):
         found = [_fit_by_cuts(setup, row, on_step) for row in rows]
     elif on_step is None:
         found = [_fit_one(setup, row) for row in rows]
@@ -152,7 +151,8 @@ def fit_each(setup: Setup, people: Person, on_step: OnStep | None = None) -> Fit
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
 
-def _has_cuts(setup: Setup) -> bool:
+def has_cuts(setup: Setup) -> bool:
+    """Whether the search on the host can take the stages: the default penalty, by no solver."""
     term = setup.regularizer
     return setup.solver is None and isinstance(term, SelfIntersection) and term.is_plain
 
@@ -183,7 +183,7 @@ def _fit_by_cuts(setup: Setup, person: Person, on_step: OnStep | None) -> FitRes
     if end is not None:
         vector, energy = jnp.asarray(end.place.vector[0], ground.dtype), end.place.energy
         converged, free = end.converged, end.is_free or not setup.free or term.folds == "count"
-    return _finished(
+    return finished(
         setup.search,
         setup.body,
         person,
@@ -202,7 +202,7 @@ def objective_of(search: KeypointSearch, person: Person) -> Objective:
 
 
 @program
-def _finished(
+def finished(
     search: KeypointSearch,
     body: BodyModel,
     person: Person,
@@ -212,6 +212,7 @@ def _finished(
     steps: Int[Array, ""],
     free: Bool[Array, ""],
 ) -> FitResult:
+    """The result of one person's fit that ended at a vector; as `fit_result`."""
     objective = search.objective(person)
     return fit_result(body, objective, vector, regularized, converged, steps, free)
 

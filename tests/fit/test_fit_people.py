@@ -67,6 +67,7 @@ def intersecting_pairs_between(body, vertices):
 def test_people_who_embrace_end_apart(body, fitted):
     found, seen, steps = fitted
     assert [step.stage for step in steps] == list(range(len(steps)))
+    assert [str(one) for one in found.status] == ["", ""]
     assert len(steps) >= 6 and len(steps[0].vertices) == 2 * body.num_vertices
     assert steps[0].intersecting_pairs > 0
     assert int(found.before.intersecting_pairs_between) > 0
