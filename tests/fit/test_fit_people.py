@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spt_jax import PinholeCamera, fit_people, load_body, load_mocap
+from spt_jax import RESULTS, PinholeCamera, fit_people, load_body, load_mocap
 from spt_jax.body.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 
 # Two people in each other's arms: chest to chest and turned to each other, hands on the other's
@@ -67,7 +67,7 @@ def intersecting_pairs_between(body, vertices):
 def test_people_who_embrace_end_apart(body, fitted):
     found, seen, steps = fitted
     assert [step.stage for step in steps] == list(range(len(steps)))
-    assert [str(one) for one in found.status] == ["", ""]
+    assert bool(jnp.all(found.status == RESULTS.successful))
     assert len(steps) >= 6 and len(steps[0].vertices) == 2 * body.num_vertices
     assert steps[0].intersecting_pairs > 0
     assert int(found.before.intersecting_pairs_between) > 0
