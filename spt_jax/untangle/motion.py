@@ -140,7 +140,7 @@ def untangle_motion(
             their difference in cm^2 weighs `contact_weight`. Of parts and patches, those vertices
             are tied that are nearest to each other while the two touch.
         contact_distance: in metres.
-        contact_weight: 0 lets contacts go.
+        contact_weight: 0 lets contacts go; however much it is, collisions outweigh it.
         up: the direction that is up.
         tolerance: an overlap of this volume or less, in m^3, is none where nothing intersects.
         resume: a folder in which what is done is kept, window by window, made where missing. A

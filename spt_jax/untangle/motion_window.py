@@ -10,6 +10,7 @@ from spt_jax.metrics import MotionOverlap, measured_frames
 from spt_jax.overlap.exclusions import Exclusions
 from spt_jax.untangle.anchors import Anchored, Anchors
 from spt_jax.untangle.corrections import Corrections, faces_of, posed
+from spt_jax.untangle.curved_ties import anchored_minimum
 from spt_jax.untangle.frame_cuts import FrameCuts, Prior
 
 # Rounds over a window. What a collision weighs, per cm^3 against cm^2, is first weak, so that poses
@@ -17,6 +18,9 @@ from spt_jax.untangle.frame_cuts import FrameCuts, Prior
 # still collide; then the margin grows.
 _ROUNDS = 40
 _FIRST, _MORE, _LAST = 0.02, 3.0, 200.0
+# At the least, so many times what ties a foot or contact in the frame: a contact that weighed 500
+# held frames in collision.
+_OUTWEIGHED = 10.0
 _WIDER, _WIDEST = 1.5, 4.0
 
 # Rounds after which it is first looked whether frames are free; and how many follow at the most
@@ -174,6 +178,9 @@ class _Search:
         # The best place of each frame, its overlap, and how strongly it is held there.
         self._best, self._least = np.zeros((count, size)), np.full(count, np.inf)
         self._held = np.zeros(count)
+        self._stiff = _HELD / np.diag(known.kernel)
+        tied = anchors.weight.max(axis=1, initial=0.0)
+        self._most = np.maximum(_LAST, _OUTWEIGHED * tied)
 
     def _is_free(self, overlap: MotionOverlap) -> Bool[np.ndarray, "T"]:
         return (overlap.intersecting_pairs == 0) & (overlap.volume <= self._tolerance)
@@ -216,7 +223,7 @@ class _Search:
         cost = weight * value + np.einsum("fn,fn->f", place, place)
         least = weight * self._least[frame] + np.einsum("fn,fn->f", best, best)
         worse = (cost > least) & (value > self._least[frame])
-        stiff = _HELD / np.diag(self._known.kernel)[frame]
+        stiff = self._stiff[frame]
         held = self._held[frame]
         tighter = np.maximum(_TIGHTER * held, stiff)
         looser = np.where(held > stiff, _LOOSER * held, 0.0)
@@ -226,9 +233,10 @@ class _Search:
 
     def next(self, vectors) -> Float[np.ndarray, "T N"]:
         """Where the model is least."""
-        self._anchored.look(vectors)
         known = self._known.held(self._held, self._best)
-        found = self.cuts.minimum(known, self.weight, self._anchored.ties())
+        found = anchored_minimum(
+            self.cuts, known, self.weight, self._anchored, vectors, self._stiff
+        )
         self._foreseen = self.cuts.reach(found)
         return found
 
@@ -243,8 +251,8 @@ class _Search:
 
     def _press(self, colliding: Bool[np.ndarray, "T"]) -> None:
         chosen = colliding & ~((self._surprised > 0) & (self._surprised <= _PATIENCE))
-        full = chosen & (self.weight >= _LAST)
-        self.weight[chosen] = np.minimum(self.weight[chosen] * _MORE, _LAST)
+        full = chosen & (self.weight >= self._most)
+        self.weight = np.where(chosen, np.minimum(self.weight * _MORE, self._most), self.weight)
         if full.any() and self._widest:
             self._margin[full] = np.minimum(self._margin[full] * _WIDER, self._widest)
             self._place[full] = np.nan
